@@ -1,0 +1,54 @@
+# `make` lists what can be made. Everything runs in .venv, which is made first.
+
+PYTHON ?= python3
+EXTRAS ?= dev
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+NAME_ANOTHER = name one of these, as in: make $(or $(MAKECMDGOALS),.venv) PYTHON=python3.12
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help .venv demo check format test test-all clean
+
+help:  ## this list
+	@sed -nE 's/^([.a-z-]+):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
+	@echo "PYTHON=python3.12 names the Python of a new .venv; EXTRAS=dev,notebooks what goes into it."
+
+.venv: $(STAMP)  ## the virtual environment, from the versions in constraints.txt
+
+# A .venv that works is kept, whichever Python made it: `make clean` first to change that.
+$(STAMP): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "genidm needs Python 3.11, 3.12 or 3.13, and there is no '$(PYTHON)': $(NAME_ANOTHER)" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null || { \
+	  echo "genidm needs Python 3.11, 3.12 or 3.13, and '$(PYTHON)' is $$($(PYTHON) -V 2>&1 | head -n 1): $(NAME_ANOTHER)" >&2; exit 1; }
+	@echo "Installing into $(VENV); the first time this takes a few minutes."
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@touch $@
+
+demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
+	$(BIN)/python -m experiments.ant_rs --scale quick --out runs/demo
+	$(BIN)/python -m experiments.ant_lr --scale quick --out runs/demo
+
+check: $(STAMP)  ## format, lint and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy genidm experiments
+
+format: $(STAMP)  ## mend what the linter can, and bring every file into its format
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+test: $(STAMP)  ## the tests, without the slow ones
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: $(STAMP)  ## the slow tests too
+	$(BIN)/python -m pytest
+
+clean:  ## remove .venv, caches and build outputs; runs/ stays
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache build dist genidm.egg-info
+	find genidm experiments tests -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""The paper's experiments, one small file each: only what differs (Table 2)."""

@@ -1,0 +1,1 @@
+"""Agents that collect experience, composed from the parts of `brax.training`."""

@@ -1,0 +1,121 @@
+"""Collecting (§4.1): an agent learns one task, and all it sees is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.agents.base import Agent, place
+from genidm.errors import BadInput
+from genidm.experience import Experience, concatenate, load
+from genidm.progress import Progress, compiled
+from genidm.robots.base import Robot
+from genidm.store import Stage
+from genidm.tasks import WalkForward
+
+# Transitions that are written to disk at a time.
+CHUNK = 1 << 17
+
+
+def collect(
+    robot: Robot,
+    agent: Agent,
+    interactions: int,
+    seed: int = 0,
+    *,
+    task: WalkForward | None = None,
+    mesh: Mesh | None = None,
+    stage: Stage | None = None,
+    quiet: bool = False,
+) -> tuple[Experience, Any]:
+    """Lets an agent learn for a number of interactions, and keeps every one of them.
+
+    Recording costs no interaction: what the agent learned from is what is kept, in order.
+
+    Args:
+      robot: what walks.
+      agent: PPO or RandomActions.
+      interactions: steps of one robot, counted over all lanes; rounded up to a whole
+        iteration of the agent.
+      seed: of everything random in here.
+      task: what is rewarded; walking forward, unless given.
+      mesh: devices to share the lanes among; all, unless given.
+      stage: where the record, checkpoints and metrics go; they stay in memory, unless given.
+      quiet: no progress bar.
+
+    Returns:
+      the Experience `[T, lanes, ...]`, and the agent's learner as it ended.
+    """
+    mesh = mesh or devices.mesh()
+    _check(agent, interactions, mesh)
+    learning = agent.learning(robot, task or WalkForward(), mesh)
+    learner = place(jax.jit(learning.start)(jax.random.key(seed)), mesh)
+    size = agent.lanes * agent.unroll
+    iterations = -(-interactions // size)
+    log = _Log(robot, stage, max(1, CHUNK // size))
+    done, learner = log.resume(learner, mesh)
+    if done == iterations:
+        return log.experience(), learner
+    program = compiled(f"{type(agent).__name__} iteration", learning.iterate, learner)
+    directory = stage.directory if stage else None
+    with Progress("collect", iterations * size, "steps", directory, done * size, quiet) as bar:
+        for i in range(done, iterations):
+            learner, part, metrics = program(learner)
+            log.add(part)
+            if log.full or i + 1 == iterations:
+                log.flush(i + 1, learner)
+            bar.advance(size, **{name: float(x) for name, x in metrics.items()})
+    return log.experience(), learner
+
+
+def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
+    if interactions < 1:
+        raise BadInput(f"interactions must be at least 1, not {interactions}")
+    if agent.lanes % mesh.size:
+        raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
+
+
+class _Log:
+    """The record so far: on the devices until a chunk is full, then on disk if there is a stage."""
+
+    def __init__(self, robot: Robot, stage: Stage | None, chunk: int):
+        self.robot, self.stage, self.chunk = robot, stage, chunk
+        self.parts: list[Experience] = []
+        self.chunks: list[Experience] = []
+
+    @property
+    def full(self) -> bool:
+        return len(self.parts) >= self.chunk
+
+    def add(self, part: Experience) -> None:
+        self.parts.append(part)
+
+    def flush(self, iteration: int, learner: Any) -> None:
+        """Brings the parts to the host; with a stage, also to disk, and then a checkpoint."""
+        chunk = concatenate(self.parts)
+        self.parts = []
+        self.chunks.append(chunk)
+        if self.stage:
+            chunk.save(self._path(len(self.chunks) - 1))
+            state = {"learner": learner, "chunks": len(self.chunks)}
+            self.stage.checkpoints().save(iteration, state)
+
+    def resume(self, learner: Any, mesh: Mesh) -> tuple[int, Any]:
+        """Iterations done, and the learner after them."""
+        found = self.stage and self.stage.checkpoints().latest({"learner": learner, "chunks": 0})
+        if not found:
+            return 0, learner
+        iteration, tree = found
+        self.chunks = [load(self._path(i), self.robot) for i in range(tree["chunks"])]
+        return iteration, place(tree["learner"], mesh)
+
+    def _path(self, chunk: int) -> Path:
+        assert self.stage
+        return self.stage.path("experience") / f"chunk_{chunk:05d}"
+
+    def experience(self) -> Experience:
+        return concatenate(self.chunks)

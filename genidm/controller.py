@@ -1,0 +1,104 @@
+"""A controller: (s, goal − o) → a, the fitted models with all they need to be fed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from genidm import store, symmetry
+from genidm.errors import BadInput
+from genidm.models import Architecture
+from genidm.robots.base import Robot
+
+Frame = Literal["world", "heading"]
+
+
+def in_frame(robot: Robot, frame: Frame, s: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """s `[..., S]` and d `[..., 3]` as a method sees them.
+
+    In the "heading" frame the world is turned so that the robot faces +x: the input is
+    then exactly invariant to yaw, which is what the LFM learns in the limit.
+    """
+    if frame == "world":
+        return s, d
+    yaw = robot.observation.yaw(s)
+    return robot.observation.turn(s, -yaw), symmetry.turn_vector(d, -yaw)
+
+
+def direction(displacement: jax.Array) -> jax.Array:
+    """d, the unit vector of o' − o `[..., 3]` (Remark 2); zero where there is none."""
+    length = jnp.linalg.norm(displacement, axis=-1, keepdims=True)
+    return displacement / jnp.maximum(length, 1e-6)
+
+
+class Controller(flax.struct.PyTreeNode):
+    """A fitted method: states and where to go in, actions out.
+
+    Attributes:
+      params: of the models.
+      mean: `[S]`, of the training states, in the method's frame.
+      std: `[S]`.
+      architecture: shape of the models.
+      frame: the frame that they see s and d in.
+      robot: the robot that they were fitted for.
+    """
+
+    params: Any
+    mean: jax.Array
+    std: jax.Array
+    architecture: Architecture = flax.struct.field(pytree_node=False)
+    frame: Frame = flax.struct.field(pytree_node=False)
+    robot: Robot = flax.struct.field(pytree_node=False)
+
+    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+        """Actions `[..., A]` in [−1, 1].
+
+        Args:
+          s: states `[..., S]`.
+          displacement: `[..., 3]`, from the robot to where it should go, metres.
+        """
+        s, d = in_frame(self.robot, self.frame, s, direction(displacement))
+        return jnp.clip(self.raw(s, d), -1.0, 1.0)
+
+    def normalize(self, s: jax.Array) -> jax.Array:
+        """States by the statistics of the training data, kept within ±10."""
+        return jnp.clip((s - self.mean) / self.std, -10.0, 10.0)
+
+    def latent(self, s: jax.Array, d: jax.Array) -> jax.Array:
+        """γ `[..., k]` of states and directions in the method's frame (Eq. 3)."""
+        return self.architecture.latent(self.params, self.normalize(s), d)
+
+    def raw(self, s: jax.Array, d: jax.Array) -> jax.Array:
+        """Unclipped actions of states and directions in the method's frame (Eq. 1, 4)."""
+        return self.architecture.action(self.params, self.latent(s, d))
+
+    def save(self, path: Path) -> None:
+        """Writes the controller as a directory, without pickle."""
+        leaves = jax.tree.map(
+            np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
+        )
+        meta = {"robot": self.robot.name, "frame": self.frame} | store.plain(self.architecture)
+        store.save_arrays(path, leaves, meta)
+
+
+def load(path: Path, robot: Robot) -> Controller:
+    """A saved controller.
+
+    Raises:
+      BadInput: the directory is torn, or the controller is another robot's.
+    """
+    tree, meta = store.load_arrays(path)
+    if meta["robot"] != robot.name:
+        raise BadInput(f"{path} holds a controller for {meta['robot']}, not for {robot.name}")
+    architecture = Architecture(
+        meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
+    )
+    return Controller(
+        params=tree["params"], mean=tree["mean"], std=tree["std"],
+        architecture=architecture, frame=meta["frame"], robot=robot,
+    )  # fmt: skip

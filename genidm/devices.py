@@ -1,0 +1,84 @@
+"""Where jax runs: one virtual device a core (or the GPUs), and lanes sharded over them.
+
+XLA on a CPU steps MJX on little more than one core, however many there are, so every
+batch of robots is split over several devices. Keys belong to lanes, so what is computed
+does not depend on how many devices there are, but for the order of float sums.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+LANES = "lanes"
+
+
+def configure() -> None:
+    """Sets jax up for this package; called on import, before a backend starts.
+
+    - one CPU device a core (`GENIDM_DEVICES` overrides the number; a number the user
+      has already given to jax stands);
+    - float32 matrix products at full precision (`JAX_DEFAULT_MATMUL_PRECISION` overrides);
+    - the persistent compilation cache on, in `~/.cache/genidm/xla`
+      (`JAX_COMPILATION_CACHE_DIR` overrides).
+    """
+    given = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not given and jax.config.read("jax_num_cpu_devices") < 0:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        count = int(os.environ.get("GENIDM_DEVICES", cores or 1))
+        with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
+            jax.config.update("jax_num_cpu_devices", count)
+    if jax.config.read("jax_default_matmul_precision") is None:
+        jax.config.update("jax_default_matmul_precision", "highest")
+    if jax.config.read("jax_compilation_cache_dir") is None:
+        cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "genidm" / "xla"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """The mesh whose one axis carries the lanes: all devices, unless some are named."""
+    return jax.make_mesh(
+        (len(devices or jax.devices()),),
+        (LANES,),
+        axis_types=(jax.sharding.AxisType.Auto,),
+        devices=devices,
+    )
+
+
+def spec(axis: int | None) -> PartitionSpec:
+    """Lanes on dimension `axis`; None: a copy on every device."""
+    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, LANES)
+
+
+def put(tree: Any, mesh: Mesh, axis: int | None = 0) -> Any:
+    """Moves a tree of arrays onto the mesh, lanes on dimension `axis` (None: copied)."""
+    return jax.device_put(tree, NamedSharding(mesh, spec(axis)))
+
+
+def constrain(tree: Any, mesh: Mesh, axis: int | None = 0) -> Any:
+    """Inside jit: keeps a tree of arrays sharded along `axis` (None: copied)."""
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, spec(axis)))
+
+
+def over_lanes(
+    f: Callable[..., Any], mesh: Mesh, inputs: Sequence[int | None], outputs: Any
+) -> Callable[..., Any]:
+    """`f` run by every device on its own lanes, with no talk between devices.
+
+    Args:
+      f: function of a batch of lanes.
+      mesh: the devices.
+      inputs: for each argument the dimension that carries the lanes, None if shared.
+      outputs: the same for the output, or a tuple of it.
+    """
+    out = tuple(spec(o) for o in outputs) if isinstance(outputs, tuple) else spec(outputs)
+    return jax.shard_map(
+        f, mesh=mesh, in_specs=tuple(spec(i) for i in inputs), out_specs=out, check_vma=False
+    )

@@ -1,0 +1,301 @@
+"""The paper's test (A.1.3): closest distance to the target, over a bank of scenarios.
+
+Every device has its own share of the scenarios in a queue; a lane whose episode ends
+takes the next, so that no lane waits for the longest episode of a batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.episodes import Episodes
+from genidm.errors import BadInput
+from genidm.progress import Progress, compiled
+from genidm.robots.base import Robot, State
+from genidm.scenarios import Scenarios
+from genidm.store import Stage
+from genidm.symmetry import horizontal
+from genidm.tasks import select
+
+# (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled
+# program serves every controller of the same shape.
+Steering = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Test:
+    """Settings of the test.
+
+    Attributes:
+      max_steps: an episode ends after this many steps (A.1.3: 1000).
+      reach: metres; an episode ends when the target is this near.
+      lanes: robots at once, over all devices.
+      chunk: steps a program call.
+    """
+
+    __test__ = False  # not a test case for pytest
+
+    max_steps: int = 1000
+    reach: float = 0.1
+    lanes: int = 512
+    chunk: int = 50
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1 or self.lanes < 1 or self.chunk < 1 or self.reach < 0:
+            raise BadInput("a test needs max_steps, lanes, chunk ≥ 1 and reach ≥ 0")
+
+
+class Outcome(flax.struct.PyTreeNode):
+    """What is known of each episode `[N]`, ended or not; see `Episodes`."""
+
+    closest: jax.Array
+    start: jax.Array
+    reached: jax.Array
+    fell: jax.Array
+    diverged: jax.Array
+    steps: jax.Array
+    path_length: jax.Array
+
+
+class _Queue(flax.struct.PyTreeNode):
+    """One device's share: its lanes `[L]`, its scenarios `[n]`, its results `[n]`.
+
+    Attributes:
+      robots: State `[L]`.
+      target: `[L, 3]`.
+      episode: `[L]` int32, which of the n the lane is at; n when it has none.
+      now: Outcome `[L]` of the running episodes.
+      ended: Outcome `[n]` of the ended ones.
+      taken: `[1]` int32, scenarios handed out.
+      ways: `[m, max_steps + 1, 3]`, positions in the first m episodes, which are traced.
+    """
+
+    robots: State
+    target: jax.Array
+    episode: jax.Array
+    now: Outcome
+    ended: Outcome
+    taken: jax.Array
+    ways: jax.Array
+
+
+def evaluate(
+    robot: Robot,
+    controller: Steering,
+    bank: Scenarios,
+    settings: Test | None = None,
+    *,
+    mesh: Mesh | None = None,
+    stage: Stage | None = None,
+    quiet: bool = False,
+) -> Episodes:
+    """Runs every scenario to its end.
+
+    The controller is asked anew at each step (A.1.3: "we replan at each step").
+
+    Args:
+      robot: what is steered.
+      controller: what steers it.
+      bank: scenarios `[seeds, episodes]`.
+      settings: length of an episode, reach radius, lanes.
+      mesh: devices to share the lanes among; all, unless given.
+      stage: where checkpoints and metrics go; nowhere, unless given.
+      quiet: no progress bar.
+    """
+    outcome, _ = run(
+        robot, controller, flatten(bank), settings, mesh=mesh, stage=stage, quiet=quiet
+    )
+    return episodes(outcome, bank.shape)
+
+
+def run(
+    robot: Robot,
+    controller: Steering,
+    bank: Scenarios,
+    settings: Test | None = None,
+    *,
+    traced: int = 0,
+    mesh: Mesh | None = None,
+    stage: Stage | None = None,
+    quiet: bool = False,
+) -> tuple[Outcome, list[np.ndarray]]:
+    """`evaluate` on scenarios `[N]`, the first of them traced.
+
+    Args:
+      robot: what is steered.
+      controller: what steers it.
+      bank: scenarios `[N]` (`flatten`).
+      settings: length of an episode, reach radius, lanes.
+      traced: how many of the first episodes to give the ways of.
+      mesh: devices to share the lanes among; all, unless given.
+      stage: where checkpoints and metrics go; nowhere, unless given.
+      quiet: no progress bar.
+
+    Returns:
+      outcomes `[N]`, and for each traced episode its positions `[steps + 1, 3]`.
+    """
+    settings, mesh = settings or Test(), mesh or devices.mesh()
+    queue, shares = _queues(robot, bank, settings, traced, mesh)
+    checkpoints = stage.checkpoints() if stage else None
+    found = checkpoints.latest(queue) if checkpoints else None
+    calls, queue = (found[0], devices.put(found[1], mesh)) if found else (0, queue)
+    controller = devices.put(controller, mesh, None)
+    body = functools.partial(_chunk, robot, settings)
+    sharded = devices.over_lanes(body, mesh, [None, 0, 0], 0)
+    program = compiled("evaluation", jax.jit(sharded, donate_argnums=1), controller, queue, shares)
+    total = bank.yaw.shape[0]
+    done = _count(queue, total, mesh)
+    directory = stage.directory if stage else None
+    with Progress("evaluate", total, "episodes", directory, done, quiet) as bar:
+        while done < total:
+            queue = program(controller, queue, shares)
+            calls += 1
+            before, done = done, _count(queue, total, mesh)
+            bar.advance(done - before, useful=_useful(queue, settings, calls, mesh))
+            if checkpoints and checkpoints.due():
+                checkpoints.save(calls, queue)
+    outcome = jax.tree.map(lambda x: _in_order(x, mesh)[:total], queue.ended)
+    ways = _in_order(queue.ways, mesh)
+    return outcome, [ways[i, : outcome.steps[i] + 1] for i in range(traced)]
+
+
+def flatten(*banks: Scenarios) -> Scenarios:
+    """Banks `[seeds, episodes]` one after another, as scenarios `[N]`."""
+
+    def join(*parts: Any) -> Any:
+        return jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in parts])
+
+    return jax.tree.map(join, *banks)
+
+
+def episodes(outcome: Outcome, shape: tuple[int, int]) -> Episodes:
+    """Outcomes `[seeds × episodes]` as Episodes `[seeds, episodes]`."""
+    names = [f.name for f in dataclasses.fields(Outcome)]
+    return Episodes(**{name: np.asarray(getattr(outcome, name)).reshape(shape) for name in names})
+
+
+def _queues(
+    robot: Robot, bank: Scenarios, settings: Test, traced: int, mesh: Mesh
+) -> tuple[_Queue, Scenarios]:
+    """Idle lanes, and the scenarios dealt out to the devices in turn, short shares filled up."""
+    count, total = mesh.size, bank.yaw.shape[0]
+    share = -(-total // count)
+    lanes = count * min(-(-settings.lanes // count), share)
+    dealt = np.minimum(np.arange(share * count), total - 1).reshape(share, count).T.reshape(-1)
+    shapes = jax.eval_shape(
+        robot.reset, jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes)
+    )
+    queue = _Queue(
+        robots=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
+        target=jnp.zeros((lanes, 3)),
+        episode=jnp.full(lanes, share, jnp.int32),
+        now=_nothing(lanes),
+        ended=_nothing(share * count),
+        taken=jnp.zeros(count, jnp.int32),
+        ways=jnp.zeros((-(-traced // count) * count, settings.max_steps + 1, 3)),
+    )
+    shares = jax.tree.map(lambda x: x[dealt], bank)
+    return devices.put(queue, mesh), devices.put(shares, mesh)
+
+
+def _in_order(x: jax.Array, mesh: Mesh) -> np.ndarray:
+    """Undoes the dealing out: `[devices × n, ...]` in the order of the bank."""
+    dealt = np.asarray(x)
+    rows = dealt.reshape(mesh.size, -1, *dealt.shape[1:])
+    return rows.swapaxes(0, 1).reshape(dealt.shape)
+
+
+def _nothing(count: int) -> Outcome:
+    number, no = jnp.zeros(count), jnp.zeros(count, bool)
+    return Outcome(number, number, no, no, no, jnp.zeros(count, jnp.int32), number)
+
+
+def _count(queue: _Queue, total: int, mesh: Mesh) -> int:
+    """Episodes that have ended, those that fill up a share not counted."""
+    return int((_in_order(queue.ended.steps, mesh)[:total] > 0).sum())
+
+
+def _useful(queue: _Queue, settings: Test, calls: int, mesh: Mesh) -> float:
+    """Share of the lane-steps so far that were spent in episodes."""
+    idle = queue.ended.steps.shape[0] // mesh.size
+    running = np.where(np.asarray(queue.episode) < idle, queue.now.steps, 0)
+    steps = np.asarray(queue.ended.steps).sum() + running.sum()
+    return float(steps / (calls * settings.chunk * queue.episode.shape[0]))
+
+
+def _chunk(
+    robot: Robot, settings: Test, controller: Steering, queue: _Queue, shares: Scenarios
+) -> _Queue:
+    """`settings.chunk` steps of one device's lanes."""
+
+    def step(queue: _Queue, _: None) -> tuple[_Queue, None]:
+        queue = _take(robot, queue, shares)
+        return _step(robot, settings, controller, queue), None
+
+    queue, _ = jax.lax.scan(step, queue, length=settings.chunk)
+    return queue
+
+
+def _take(robot: Robot, queue: _Queue, shares: Scenarios) -> _Queue:
+    """Idle lanes take the next scenarios of the queue, while there are any."""
+    total = shares.yaw.shape[0]
+    idle = queue.episode >= total
+    rank = queue.taken + jnp.cumsum(idle) - 1
+    takes = idle & (rank < total)
+    episode = jnp.where(takes, rank, queue.episode).astype(jnp.int32)
+    new = jax.tree.map(lambda x: x[jnp.minimum(episode, total - 1)], shares)
+    robots = robot.reset(new.keys, new.yaw)
+    distance = horizontal(new.target - robots.position)
+    fresh = _nothing(episode.shape[0]).replace(closest=distance, start=distance)
+    slot = jnp.where(takes, episode, total)
+    return queue.replace(
+        robots=select(takes, robots, queue.robots),
+        target=select(takes, new.target, queue.target),
+        episode=episode,
+        now=select(takes, fresh, queue.now),
+        taken=queue.taken + takes.sum(),
+        ways=queue.ways.at[slot, 0].set(robots.position, mode="drop"),
+    )
+
+
+def _step(robot: Robot, settings: Test, controller: Steering, queue: _Queue) -> _Queue:
+    """One step of every lane; what ended is written down, and its lane is idle."""
+    before = queue.robots
+    action = controller(before.observation, queue.target - before.position)
+    after = robot.step(before, action)
+    now = _observe(queue.now, before, after, queue.target, settings.reach)
+    total = queue.ended.steps.shape[0]
+    over = now.reached | now.fell | now.diverged | (now.steps >= settings.max_steps)
+    over &= queue.episode < total
+    slot = jnp.where(over, queue.episode, total)
+    return queue.replace(
+        robots=after,
+        now=now,
+        ended=jax.tree.map(lambda kept, x: kept.at[slot].set(x, mode="drop"), queue.ended, now),
+        episode=jnp.where(over, total, queue.episode),
+        ways=queue.ways.at[queue.episode, now.steps].set(after.position, mode="drop"),
+    )
+
+
+def _observe(now: Outcome, before: State, after: State, target: jax.Array, reach: float) -> Outcome:
+    """The outcomes so far, with one more step in them."""
+    distance = horizontal(target - after.position)
+    return Outcome(
+        closest=jnp.minimum(now.closest, distance),
+        start=now.start,
+        reached=distance <= reach,
+        fell=after.fallen,
+        diverged=after.diverged,
+        steps=now.steps + 1,
+        path_length=now.path_length + horizontal(after.position - before.position),
+    )

@@ -1,0 +1,130 @@
+"""Experience (Def. 1): what a robot did while it learned something else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from genidm import store
+from genidm.errors import BadInput
+from genidm.robots.base import Robot
+from genidm.tasks import Step
+
+
+class Experience(flax.struct.PyTreeNode):
+    """Recorded transitions, T steps of B lanes, in the order they happened.
+
+    Attributes:
+      s: `[T, B, S]`, state before the step.
+      o: `[T, B, 3]`, position before the step, metres, world frame.
+      o_next: `[T, B, 3]`, position after it, before any reset.
+      a: `[T, B, A]`, action in [−1, 1].
+      first: `[T, B]` bool, the first step of an episode.
+      last: `[T, B]` bool, the last step of an episode.
+      valid: `[T, B]` bool, False where the physics diverged in the step.
+      physics: tree `[T, B, ...]`, physics before the step, or None for a log that has
+        none: it can be rotated exactly (`Generalize(mode="rotate")`), but not replayed.
+    """
+
+    s: Any
+    o: Any
+    o_next: Any
+    a: Any
+    first: Any
+    last: Any
+    valid: Any
+    physics: Any = None
+
+    @property
+    def interactions(self) -> int:
+        """Number of recorded transitions."""
+        return self.first.shape[0] * self.first.shape[1]
+
+    def first_share(self, share: float) -> Experience:
+        """The earliest `share` of the record, in (0, 1]."""
+        steps = max(1, round(self.first.shape[0] * share))
+        return jax.tree.map(lambda x: x[:steps], self)
+
+    def first_half(self) -> Experience:
+        """What GE and LR learn from (A.1.2)."""
+        return self.first_share(0.5)
+
+    def save(self, path: Path) -> None:
+        """Writes the record as a directory of arrays, without pickle."""
+        store.save_arrays(path, flax.serialization.to_state_dict(self), {}, overwrite=True)
+
+    def check(self, state_size: int, action_size: int) -> None:
+        """Refuses a record that cannot be learned from.
+
+        Raises:
+          BadInput: the shapes do not fit together or the robot, or numbers are not finite.
+        """
+        lanes = self.first.shape
+        for name, size in (("s", state_size), ("o", 3), ("o_next", 3), ("a", action_size)):
+            x = getattr(self, name)
+            if x.shape != (*lanes, size):
+                raise BadInput(f"experience: {name} has shape {x.shape}, not {(*lanes, size)}")
+            if not np.isfinite(x).all():
+                raise BadInput(f"experience: {name} holds NaN or infinity")
+
+
+def record(step: Step) -> Experience:
+    """The experience in one transition of B lanes, arrays `[B, ...]`."""
+    return Experience(
+        s=step.before.observation,
+        o=step.before.position,
+        o_next=step.after.position,
+        a=step.action,
+        first=step.first,
+        last=step.last,
+        valid=~step.after.diverged,
+        physics=step.before.physics,
+    )
+
+
+def concatenate(parts: list[Experience]) -> Experience:
+    """Records that follow one another in time, as one, on the host."""
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(p) for p in x]), *parts)
+
+
+def load(path: Path, robot: Robot) -> Experience:
+    """A record that `Experience.save` wrote.
+
+    Raises:
+      BadInput: the directory is torn, or the record is another robot's.
+    """
+    tree, _ = store.load_arrays(path)
+    physics = tree.pop("physics", None)
+    if physics is not None:
+        physics = flax.serialization.from_state_dict(robot.physics, physics)
+    experience = Experience(**tree, physics=physics)
+    experience.check(robot.observation.size, robot.action.size)
+    return experience
+
+
+def load_chunks(directory: Path, robot: Robot) -> Experience:
+    """The record that `collect` wrote in chunks."""
+    return concatenate([load(path, robot) for path in sorted(directory.glob("chunk_*"))])
+
+
+def goal_step(last: jax.Array, look_ahead: int) -> jax.Array:
+    """The step `[T, B]` whose outcome is the intermediate goal o' of each step.
+
+    It lies `look_ahead` − 1 steps later (so 1 is the paper's "next position"), or at the
+    end of the episode or record where that comes first.
+
+    Args:
+      last: `[T, B]` bool, the last step of an episode.
+      look_ahead: steps, at least 1.
+    """
+    steps = last.shape[0]
+    time = jnp.arange(steps)[:, None]
+    ends = jnp.where(last, time, steps - 1)
+    end = jax.lax.cummin(ends, axis=0, reverse=True)
+    return jnp.minimum(time + look_ahead - 1, end)

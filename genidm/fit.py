@@ -1,0 +1,225 @@
+"""Fitting IDM and LFM/IDM: the losses of Eq. 5–7 and one jitted loop for every method."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from genidm.controller import Controller, Frame, in_frame
+from genidm.errors import BadInput
+from genidm.generalize import Pairs
+from genidm.models import Architecture
+from genidm.progress import Progress, compiled
+from genidm.robots.base import Robot
+from genidm.store import Stage
+
+STD_FLOOR = 1e-2
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Settings of a fit.
+
+    States are normalised by the mean and standard deviation of the samples; the deviation
+    counts as 0.01 at least, so that numbers that hardly ever move are not blown up.
+
+    Attributes:
+      updates: minibatches learned from.
+      batch: samples a minibatch (A.1.2: 512).
+      learning_rate: of Adam (A.1.2: 1e-3), at the start.
+      decay: the learning rate falls to 0 along a cosine; off, it stays (the paper's).
+      idm: hidden layers of φ (Table 2).
+      lfm: hidden layers of ψ (Table 2).
+      latent_size: k; None fits an IDM alone.
+      latent_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
+    """
+
+    updates: int = 20_000
+    batch: int = 512
+    learning_rate: float = 1e-3
+    decay: bool = True
+    idm: tuple[int, ...] = (256, 256)
+    lfm: tuple[int, ...] = (256, 256)
+    latent_size: int | None = None
+    latent_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0 < self.latent_weight < 1:
+            raise BadInput(f"λ (latent_weight) must lie in (0, 1), not at {self.latent_weight}")
+        if self.latent_size is not None and self.latent_size < 1:
+            raise BadInput(f"k (latent_size) must be at least 1, not {self.latent_size}")
+        if self.updates < 1 or self.batch < 1:
+            raise BadInput("updates and batch must be at least 1")
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam, with the schedule."""
+        rate = self.learning_rate
+        return optax.adam(optax.cosine_decay_schedule(rate, self.updates) if self.decay else rate)
+
+
+def loss_latent(latent: jax.Array, latent_hat: jax.Array) -> jax.Array:
+    """L1 (Eq. 5): squared distance of the latents `[..., k]` of e.m.o. samples, batch mean."""
+    return jnp.mean(jnp.sum((latent - latent_hat) ** 2, axis=-1))
+
+
+def loss_action(predicted: jax.Array, action: jax.Array) -> jax.Array:
+    """L2 (Eq. 6): squared distance of actions `[..., A]`, batch mean."""
+    return jnp.mean(jnp.sum((predicted - action) ** 2, axis=-1))
+
+
+def loss_plain(model: Controller, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L2 of an IDM on samples of one view each; what RS, RL and GE minimise."""
+    action = loss_action(model.raw(batch.s[0], batch.d[0]), batch.a)
+    return action, {"loss": action, "loss_action": action}
+
+
+def loss_siamese(
+    model: Controller, batch: Pairs, latent_weight: float
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees the mean latent (Eq. 6)."""
+    gamma, gamma_hat = model.latent(batch.s, batch.d)
+    latent = loss_latent(gamma, gamma_hat)
+    predicted = model.architecture.action(model.params, (gamma + gamma_hat) / 2)
+    action = loss_action(predicted, batch.a)
+    loss = latent_weight * latent + (1 - latent_weight) * action
+    return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}
+
+
+def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:
+    """A minibatch from all views alike: G as a set (GE), `s [1, size, S]`."""
+    which, seen = jax.random.split(key)
+    n = jax.random.randint(which, (size,), 0, samples.a.shape[0])
+    v = jax.random.randint(seen, (size,), 0, samples.s.shape[0])
+    return Pairs(samples.s[v, n][None], samples.d[v, n][None], samples.a[n])
+
+
+def draw_siamese(samples: Pairs, key: jax.Array, size: int) -> Pairs:
+    """A minibatch of e.m.o. pairs: the record and one of its copies, `s [2, size, S]`."""
+    which, seen = jax.random.split(key)
+    n = jax.random.randint(which, (size,), 0, samples.a.shape[0])
+    v = jax.random.randint(seen, (size,), 1, samples.s.shape[0])
+    both = jnp.stack([jnp.zeros_like(v), v])
+    return Pairs(samples.s[both, n], samples.d[both, n], samples.a[n])
+
+
+class Learner(flax.struct.PyTreeNode):
+    """All that a fit carries from one update to the next."""
+
+    model: Controller
+    optimizer: Any
+    key: jax.Array
+    update: jax.Array
+
+
+def fit(
+    robot: Robot,
+    samples: Pairs,
+    key: jax.Array,
+    settings: Fit | None = None,
+    *,
+    frame: Frame = "world",
+    stage: Stage | None = None,
+    chunk: int = 1000,
+    quiet: bool = False,
+) -> Controller:
+    """Fits a controller to samples.
+
+    Args:
+      robot: whose states and actions the samples hold.
+      samples: E, or G = E ∪ 𝒢(E); with a latent they need two views at least.
+      key: of the parameters and the minibatches.
+      settings: networks, losses, schedule.
+      frame: the frame that the models see s and d in.
+      stage: where checkpoints and metrics go; nowhere, unless given.
+      chunk: updates a program call.
+      quiet: no progress bar.
+
+    Raises:
+      BadInput: a latent was asked for, and there is only one view.
+    """
+    settings = settings or Fit()
+    if settings.latent_size is not None and samples.s.shape[0] < 2:
+        raise BadInput("an LFM is fitted to pairs, and these samples have one view only")
+    samples = jax.jit(functools.partial(_framed, robot, frame))(_on_first_device(samples))
+    learner = _start(robot, samples, key, settings, frame)
+    checkpoints = stage.checkpoints() if stage else None
+    found = checkpoints.latest(learner) if checkpoints else None
+    done, learner = (found[0], _on_first_device(found[1])) if found else (0, learner)
+    program = compiled(
+        "fit", jax.jit(_updates(settings), donate_argnums=0), learner, samples, jnp.int32(0)
+    )
+    directory = stage.directory if stage else None
+    with Progress("fit", settings.updates, "updates", directory, done, quiet) as bar:
+        while done < settings.updates:
+            count = min(chunk, settings.updates - done)
+            learner, info = program(learner, samples, jnp.int32(count))
+            done += count
+            bar.advance(count, **{name: float(x) for name, x in info.items()})
+            if checkpoints and checkpoints.due():
+                checkpoints.save(done, learner)
+    return learner.model
+
+
+def _on_first_device(tree: Any) -> Any:
+    # A fit is matrix products, which XLA spreads over the cores by itself.
+    return jax.device_put(tree, jax.devices()[0])
+
+
+def _framed(robot: Robot, frame: Frame, samples: Pairs) -> Pairs:
+    s, d = in_frame(robot, frame, samples.s, samples.d)
+    return Pairs(s, d, samples.a)
+
+
+def _start(robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: Frame) -> Learner:
+    params, stream = jax.random.split(key)
+    architecture = Architecture(robot.action.size, settings.idm, settings.lfm, settings.latent_size)
+    mean, std = jax.jit(lambda s: (s.mean((0, 1)), s.std((0, 1))))(samples.s)
+    model = Controller(
+        params=architecture.init(params, robot.observation.size),
+        mean=mean,
+        std=jnp.maximum(std, STD_FLOOR),
+        architecture=architecture,
+        frame=frame,
+        robot=robot,
+    )
+    state = settings.optimizer().init(model.params)
+    return _on_first_device(Learner(model, state, stream, jnp.zeros((), jnp.int32)))
+
+
+def _updates(settings: Fit) -> Any:
+    """The program (learner, samples, count) → (learner, mean losses) of `count` updates."""
+    siamese = settings.latent_size is not None
+    draw = draw_siamese if siamese else draw_plain
+    loss = (
+        functools.partial(loss_siamese, latent_weight=settings.latent_weight)
+        if siamese
+        else loss_plain
+    )
+    optimizer = settings.optimizer()
+
+    def update(learner: Learner, samples: Pairs) -> tuple[Learner, dict[str, jax.Array]]:
+        # The key of an update depends on its number alone, not on the call it is in.
+        batch = draw(samples, jax.random.fold_in(learner.key, learner.update), settings.batch)
+        of_params = lambda params: loss(learner.model.replace(params=params), batch)  # noqa: E731
+        grads, info = jax.grad(of_params, has_aux=True)(learner.model.params)
+        step, state = optimizer.update(grads, learner.optimizer)
+        model = learner.model.replace(params=optax.apply_updates(learner.model.params, step))
+        return Learner(model, state, learner.key, learner.update + 1), info
+
+    def run(learner: Learner, samples: Pairs, count: jax.Array) -> tuple[Learner, dict]:
+        def body(_: int, carry: tuple[Learner, dict]) -> tuple[Learner, dict]:
+            learner, info = update(carry[0], samples)
+            return learner, jax.tree.map(jnp.add, carry[1], info)
+
+        _, shapes = jax.eval_shape(update, learner, samples)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        learner, info = jax.lax.fori_loop(0, count, body, (learner, zeros))
+        return learner, jax.tree.map(lambda x: x / count, info)
+
+    return run

@@ -1,0 +1,200 @@
+"""How far a stage is: a bar with rate and time left, metrics as JSONL and TensorBoard.
+
+`metrics.jsonl` is the record; TensorBoard's files are written from it anew when a stage is
+resumed, so that neither shows a part of a curve twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from genidm.errors import BadInput
+from genidm.store import disk, save_text
+
+METRICS = "metrics.jsonl"
+# tensorboardX waits for the disk at each flush, so that happens every so many seconds.
+FLUSH_SECONDS = 5.0
+
+
+def compiled(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
+    """Compiles a jitted function ahead of its first call, and says how long that took.
+
+    Args:
+      name: what the function is, for the line on stderr.
+      jitted: what `jax.jit` returned.
+      args: its arguments, or `jax.ShapeDtypeStruct`s with shardings in their place.
+
+    Returns:
+      the compiled program; it takes arguments of these shapes, dtypes and shardings, less
+      the static ones.
+    """
+    start = time.perf_counter()
+    if sys.stderr.isatty():
+        print(f"compiling {name} …", end="\r", file=sys.stderr, flush=True)
+    program: Callable[..., Any] = jitted.lower(*args).compile()
+    seconds = time.perf_counter() - start
+    tqdm.write(f"compiled {name} in {seconds:.{0 if seconds >= 10 else 1}f} s", file=sys.stderr)
+    return program
+
+
+class Progress:
+    """A bar on stderr, and the metrics of a stage on disk; a context manager.
+
+        with Progress("ppo", 2_000_000, "steps", stage.directory, initial=step) as progress:
+            progress.advance(4096, reward=reward)
+
+    Attributes:
+      done: units done, those before a resume included.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        total: int,
+        unit: str,
+        directory: Path | str | None = None,
+        initial: int = 0,
+        quiet: bool = False,
+    ):
+        """Starts the bar.
+
+        Args:
+          name: what is going on, in front of the bar.
+          total: units in all.
+          unit: what is counted, for the rate.
+          directory: where `metrics.jsonl` and TensorBoard's files go; None: nowhere. One
+            stage a directory: what it holds beyond `initial` is dropped.
+          initial: units done before a resume.
+          quiet: show no bar.
+
+        Raises:
+          BadInput: the directory cannot be written, or its metrics cannot be read.
+        """
+        self.done = initial
+        self._curves = _Curves(Path(directory), initial) if directory is not None else None
+        live = sys.stderr.isatty() or "ipykernel" in sys.modules
+        self._bar = tqdm(
+            desc=name,
+            total=total,
+            initial=initial,
+            unit=f" {unit}",
+            unit_scale=True,
+            dynamic_ncols=True,
+            mininterval=0.2 if live else 10.0,  # a log file gets a line now and then
+            disable=quiet,
+            file=sys.stderr,
+        )
+
+    def advance(self, n: int, /, **metrics: Any) -> None:
+        """Counts `n` more units, and records metrics (numbers, or arrays of one) if any.
+
+        Metrics that are not finite are `null` in the JSONL and absent from TensorBoard.
+
+        Raises:
+          BadInput: the disk is full.
+        """
+        self.done += n
+        if metrics:
+            numbers = {name: _number(x) for name, x in metrics.items()}
+            shown = {k: "nan" if x is None else f"{x:.4g}" for k, x in numbers.items()}
+            self._bar.set_postfix(shown, refresh=False)
+            if self._curves:
+                self._curves.add({"step": self.done, "time": round(time.time(), 3), **numbers})
+        self._bar.update(n)
+
+    def close(self) -> None:
+        """Ends the bar and closes the files."""
+        self._bar.close()
+        if self._curves:
+            self._curves.close()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class _Curves:
+    """The metrics of one directory, as JSONL and as TensorBoard's events."""
+
+    def __init__(self, directory: Path, initial: int):
+        self._path = directory / METRICS
+        there = read_metrics(self._path) if initial > 0 and self._path.exists() else []
+        kept = [line for line in there if line["step"] <= initial]
+        save_text(self._path, "".join(json.dumps(line) + "\n" for line in kept))
+        with disk(directory):
+            self._lines: IO[str] = self._path.open("a", encoding="utf-8", buffering=1)
+            self._events = _events(directory)
+            self._flushed = time.monotonic()
+            for line in kept:
+                self._show(line)
+
+    def add(self, line: dict[str, Any]) -> None:
+        with disk(self._path):
+            self._lines.write(json.dumps(line, allow_nan=False) + "\n")
+            self._show(line)
+            if time.monotonic() - self._flushed > FLUSH_SECONDS:
+                self._events.flush()
+                self._flushed = time.monotonic()
+
+    def _show(self, line: dict[str, Any]) -> None:
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.summary import scalar
+
+        for name, value in line.items():
+            if name not in ("step", "time") and value is not None:
+                at = {"wall_time": line["time"], "step": line["step"]}
+                self._events.write_event(Event(**at, summary=scalar(name, value)))
+
+    def close(self) -> None:
+        with disk(self._path), contextlib.closing(self._lines):
+            self._events.close()
+
+
+def _events(directory: Path) -> Any:
+    """A fresh event file, in place of those there.
+
+    Not tensorboardX's SummaryWriter: that writes in a thread, which dies silently on a
+    full disk and then blocks its caller for ever.
+    """
+    from tensorboardX.event_file_writer import EventsWriter
+
+    for old in directory.glob("events.out.tfevents.*"):
+        old.unlink()
+    return EventsWriter(str(directory / "events"))
+
+
+def _number(x: Any) -> float | int | None:
+    value: float | int = np.asarray(x).item()
+    return value if math.isfinite(value) else None
+
+
+def read_metrics(path: Path | str) -> list[dict[str, Any]]:
+    """The lines of a `metrics.jsonl`: `step`, `time` (seconds since 1970) and the metrics.
+
+    A last line that was cut short is left out.
+
+    Raises:
+      BadInput: the file is missing, or is torn before its last line.
+    """
+    with disk(path):
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    metrics = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            metrics.append(json.loads(line))
+        except ValueError:
+            if number < len(lines):
+                raise BadInput(f"{path} is torn in line {number}") from None
+    return metrics

@@ -1,0 +1,191 @@
+"""The report of a robot's runs: the table and the figures, from what lies on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from genidm import stats, store, symmetry
+from genidm.episodes import Episodes
+from genidm.evaluate import Test
+from genidm.methods import ORDER
+from genidm.progress import METRICS, read_metrics
+from genidm.report import figures, table
+from genidm.report.paper import TABLE1
+from genidm.report.table import Row
+from genidm.robots import Robot
+from genidm.scenarios import TOUR, UNSEEN_YAW, Scenarios, tours
+
+
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """A finished test, as its stage holds it."""
+
+    directory: Path
+    summary: dict[str, Any]
+
+    def load(self) -> tuple[Episodes, list[np.ndarray]]:
+        """The outcome, and the ways of the tours (Fig. 8)."""
+        tree, _ = store.load_arrays(self.directory / "episodes")
+        ways = tree.get("ways", {})
+        return Episodes(**tree["episodes"]), [ways[str(i)] for i in range(len(ways))]
+
+
+def tests(root: Path, scale: str, settings: Test) -> Iterator[Tested]:
+    """All finished tests of a robot at a scale, oldest first."""
+    done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
+    for path in done:
+        summary = store.load_json(path)
+        if summary["scale"] == scale and summary["test"] == store.plain(settings):
+            yield Tested(path.parent, summary)
+
+
+def report(
+    robot: Robot,
+    root: Path,
+    bank: Scenarios,
+    scale: str,
+    settings: Test,
+    results: Path | None = None,
+) -> Path:
+    """Writes the table and the figures of all methods that were tested on `bank`.
+
+    A method's row is its newest test with the lowest collecting seed; its newest tests with
+    the other collecting seeds, on whatever part of the bank, give the spread.
+
+    Args:
+      robot: whose report it is.
+      root: where its stages lie.
+      bank: the scenarios of the table.
+      scale: the scale that the methods were run at.
+      settings: of the test.
+      results: also write `ROBOT.json` and the figures there.
+
+    Returns:
+      the directory of the report.
+    """
+    found = _by_method(tests(root, scale, settings), bank.digest())
+    rows = [_row(name, seeds) for name, seeds in found.items()]
+    written = table.results(
+        rows, robot=robot.name, scale=scale, scenarios=bank.digest(),
+        environment=store.environment(),
+    )  # fmt: skip
+    here = root / f"report-{scale}"
+    for directory, prefix in ((here, ""), (results, f"{robot.name}_")):
+        if directory:
+            _write(directory, prefix, robot, root, bank, rows, found, written)
+    return here
+
+
+def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
+    """Method → its newest test of each collecting seed, the one on the bank first."""
+    newest: dict[str, dict[int, Tested]] = {}
+    for test in done:
+        seeds = newest.setdefault(test.summary["method"], {})
+        kept = seeds.get(test.summary["seed"])
+        # A test on another part of the bank does not stand in for one on the bank.
+        if not kept or kept.summary["scenarios"] != digest or test.summary["scenarios"] == digest:
+            seeds[test.summary["seed"]] = test
+    rows = {}
+    for name in sorted(newest, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n)):
+        order = sorted(
+            newest[name].values(),
+            key=lambda t: (t.summary["scenarios"] != digest, t.summary["seed"]),
+        )
+        if order[0].summary["scenarios"] == digest:
+            rows[name] = order
+    return rows
+
+
+def _row(name: str, seeds: list[Tested]) -> Row:
+    summary = seeds[0].summary
+    outcomes = tuple(test.load()[0] for test in seeds)
+    return Row(
+        method=name,
+        episodes=outcomes[0],
+        interactions=summary["interactions"],
+        replayed=summary["replayed"],
+        settings=summary["settings"],
+        collecting_seeds=outcomes if len(outcomes) > 1 else (),
+    )
+
+
+def _write(
+    directory: Path,
+    prefix: str,
+    robot: Robot,
+    root: Path,
+    bank: Scenarios,
+    rows: list[Row],
+    found: dict[str, list[Tested]],
+    written: dict[str, Any],
+) -> None:
+    """Table and figures into one directory."""
+    paper = TABLE1.get(robot.name, {})
+    store.save_json(directory / f"{prefix or 'results'}.json".replace("_.", "."), written)
+    store.save_text(directory / f"{prefix}table.md", table.markdown(written))
+    figures.violins(rows, directory / f"{prefix}violins.png", paper)
+    figures.paths(_panels(robot, found), directory / f"{prefix}paths.png")
+    heading, bearing = _angles(robot, bank)
+    closest = {row.method: stats.masked(row.episodes) for row in rows}
+    figures.bearings(closest, bearing, heading, directory / f"{prefix}bearings.png")
+    _curves(directory, prefix, root, found)
+    names = sorted(p.name for p in directory.glob(f"{prefix}*.png"))
+    text = f"{table.text(written)}\n\nFigures in {directory}: {', '.join(names)}\n"
+    store.save_text(directory / f"{prefix}table.txt", text)
+
+
+def _panels(robot: Robot, found: dict[str, list[Tested]]) -> list[figures.Panel]:
+    """Fig. 8: the ways of each method towards targets seen and unseen while learning."""
+    target = np.asarray(tours(robot).target)
+    ways = {name: [w[:, :2] for w in seeds[0].load()[1]] for name, seeds in found.items()}
+    return [
+        ("as learned", {n: w[:TOUR] for n, w in ways.items()}, target[0, :, :2], 0.0),
+        ("turned 135°", {n: w[TOUR:] for n, w in ways.items()}, target[1, :, :2], UNSEEN_YAW),
+    ]
+
+
+def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
+    """Heading at the start, and the target's bearing from it, `[seeds, episodes]`, radians."""
+
+    def angles(keys: jax.Array, yaw: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = robot.reset(keys, yaw)
+        way = target - state.position
+        bearing = jax.numpy.arctan2(way[:, 1], way[:, 0]) - state.heading
+        return state.heading, symmetry.wrap(bearing)
+
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), bank)
+    out = jax.jit(angles)(flat.keys, flat.yaw, flat.target)
+    heading, bearing = (np.asarray(x).reshape(bank.shape) for x in out)
+    return heading, bearing
+
+
+def _curves(directory: Path, prefix: str, root: Path, found: dict[str, list[Tested]]) -> None:
+    """Learning curves of agents and fits, and the e.m.o. residual of every mode of 𝒢."""
+    agents, fits, modes = {}, {}, {}
+    for stage in sorted(root.glob("experience-*/done.json")):
+        agents[stage.parent.name.rsplit("-", 1)[0].split("-", 1)[1]] = stage.parent
+    for name, seeds in found.items():
+        fits[name] = root / seeds[0].summary["fit"]
+    for stage in sorted(root.glob("replay-*/done.json")):
+        modes[stage.parent.name.split("-")[1]] = store.load_arrays(stage.parent / "residual")[0]
+    curves = {name: _metrics(path) for name, path in agents.items()}
+    figures.learning_curves(
+        curves, directory / f"{prefix}collecting.png", ["reward", "speed"], "interactions"
+    )
+    curves = {name: _metrics(path) for name, path in fits.items()}
+    figures.learning_curves(
+        curves, directory / f"{prefix}fitting.png", ["loss_action", "loss_latent"], "updates"
+    )
+    if modes:
+        figures.residuals(modes, directory / f"{prefix}residual.png")
+
+
+def _metrics(stage: Path) -> list[dict[str, Any]]:
+    path = stage / METRICS
+    return read_metrics(path) if path.exists() else []

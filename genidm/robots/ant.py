@@ -1,0 +1,77 @@
+"""The Ant: four legs, eight torques, a 111-D state (Table 1, A.1.1)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from genidm import symmetry
+from genidm.robots.base import State
+from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
+from genidm.symmetry import Layout
+
+
+class Ant(MjxRobot):
+    """gymnasium's Ant on MJX.
+
+    s `[111]` is 13 of the 15 numbers of qpos (without x and y), the 14 of qvel, and the
+    external wrench on each of the 14 bodies, the world counted, clipped to ±1: the layout
+    of gymnasium's Ant up to version 4. Two numbers differ from gymnasium's, so that every
+    field transforms exactly: quaternions have w ≥ 0, and a wrench's horizontal part is
+    clipped by its length, not by its components along the world's axes.
+    """
+
+    name = "ant"
+    control_step = 0.05
+    standing_height = 0.55
+    target_distance = (2.0, 5.0)
+    healthy_height = (0.2, 1.0)
+    paper_interactions = 2_000_000
+    # gymnasium's weights of the walking reward.
+    alive_bonus = 1.0
+    control_cost = 0.5
+    contact_cost = 5e-4
+
+    def __init__(self, solver: Solver | None = None):
+        solver = solver or Solver()
+        super().__init__(load(ASSETS / "ant.xml", solver), frames=5)
+        self.settings = {"name": self.name, "solver": solver}
+        m = self.mirror
+        self.observation = Layout(
+            (
+                symmetry.invariant("height", unit="m"),
+                symmetry.quaternion("orientation"),
+                symmetry.joints("joint angles", m.hinges, m.signs, "rad"),
+                symmetry.vector("velocity", "m/s"),
+                symmetry.body_pseudovector("spin"),
+                symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s"),
+                symmetry.wrenches("contact", m.bodies),
+            )
+        )
+
+    def rest_pose(self) -> np.ndarray:
+        return self.mj_model.numeric("init_qpos").data.astype(np.float32)
+
+    def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
+        qpos = physics.qpos.at[3:7].set(symmetry.positive(physics.qpos[3:7]))
+        wrenches = clip_wrenches(contact).reshape(-1)
+        return jnp.concatenate([qpos[2:], physics.qvel, wrenches])
+
+    def cost(self, state: State, action: jax.Array) -> jax.Array:
+        contact = self.observation.part(state.observation, "contact")
+        control = self.control_cost * jnp.sum(action**2, axis=-1)
+        return control + self.contact_cost * jnp.sum(contact**2, axis=-1)
+
+
+def clip_wrenches(wrenches: jax.Array) -> jax.Array:
+    """Wrenches `[n, 6]` with every number in ±1, in a way that commutes with a turn.
+
+    Clipping x and y each, as gymnasium does, follows the world's axes and would break
+    Def. 3; here the horizontal part of torque and of force is shortened to length 1.
+    """
+    parts = wrenches.reshape(-1, 2, 3)
+    length = symmetry.horizontal(parts)[..., None]
+    level = parts[..., :2] / jnp.maximum(length, 1.0)
+    upright = jnp.clip(parts[..., 2:], -1.0, 1.0)
+    return jnp.concatenate([level, upright], axis=-1).reshape(wrenches.shape)

@@ -1,0 +1,96 @@
+"""The Robot contract: a batch of lanes, each with one robot in it.
+
+Agents, 𝒢 and the evaluator know robots through this alone. A robot is pure: state in,
+state out, so the caller may jit, scan, shard or replay it at will.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import flax.struct
+import jax
+
+from genidm.symmetry import Layout
+
+
+class State(flax.struct.PyTreeNode):
+    """B robots after a reset, a step, or a placing.
+
+    Attributes:
+      physics: tree of arrays `[B, ...]`: all that the next step depends on.
+      observation: s `[B, S]`.
+      position: o `[B, 3]`, of the base, metres, world frame.
+      heading: yaw `[B]`, radians: where the body's x axis points.
+      fallen: `[B]` bool; the episode ends here.
+      diverged: `[B]` bool; the physics left the finite numbers in this step. The other
+        fields then repeat the state before it, and the episode ends here.
+    """
+
+    physics: Any
+    observation: jax.Array
+    position: jax.Array
+    heading: jax.Array
+    fallen: jax.Array
+    diverged: jax.Array
+
+
+class Robot(abc.ABC):
+    """What can be walked.
+
+    Attributes:
+      name: lower case, as it stands in paths and on the command line.
+      observation: layout of s `[S]`.
+      physics: tree of layouts, shaped like `State.physics`.
+      action: layout of a `[A]`, in [−1, 1].
+      control_step: seconds a step.
+      standing_height: metres; height of the base of a standing robot, and so of targets.
+      target_distance: metres, least and greatest, of the paper's test (A.1.3).
+      alive_bonus: reward of a step without a fall.
+      paper_interactions: steps that the paper collects (A.1.2).
+      settings: what the robot was made with, for the names of run directories.
+    """
+
+    name: ClassVar[str]
+    control_step: ClassVar[float]
+    standing_height: ClassVar[float]
+    target_distance: ClassVar[tuple[float, float]]
+    alive_bonus: ClassVar[float]
+    paper_interactions: ClassVar[int]
+    settings: dict[str, Any]
+    observation: Layout
+    physics: Any
+    action: Layout
+
+    @abc.abstractmethod
+    def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
+        """Fresh starts, all different, near the origin.
+
+        Args:
+          keys: `[B]`, one a lane.
+          yaw: `[B]`, radians, that the start is turned by.
+        """
+
+    @abc.abstractmethod
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step under actions `[B, A]`."""
+
+    @abc.abstractmethod
+    def place(self, physics: Any, yaw: jax.Array) -> State:
+        """Recorded physics, turned by `yaw [B]` about the vertical through the origin.
+
+        Readings that only a step can give (contact forces) are zero until one is made.
+        """
+
+    @abc.abstractmethod
+    def cost(self, state: State, action: jax.Array) -> jax.Array:
+        """Control and contact costs `[B]` of the step that led to `state` under `action`."""
+
+    def turn_physics(self, physics: Any, yaw: jax.Array) -> Any:
+        """Physics after the world is turned by `yaw [B]`."""
+        return jax.tree.map(lambda layout, x: layout.turn(x, yaw), self.physics, physics)
+
+    def mirror_physics(self, physics: Any) -> Any:
+        """Physics after the reflection y → −y."""
+        return jax.tree.map(lambda layout, x: layout.mirror(x), self.physics, physics)

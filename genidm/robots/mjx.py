@@ -1,0 +1,228 @@
+"""What robots on MuJoCo's MJX share: stepping, resets, and the mirror image of a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import brax
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from etils import epath
+from mujoco import mjx
+
+from genidm import symmetry
+from genidm.robots.base import Robot, State
+from genidm.symmetry import Layout
+
+ASSETS = epath.Path(brax.__file__).parent / "envs" / "assets"
+
+
+class Physics(flax.struct.PyTreeNode):
+    """All of `mjx.Data` that a step depends on; the rest is rebuilt from a template.
+
+    Attributes:
+      qpos: `[B, nq]`; base position (m) and quaternion, then joint angles (rad).
+      qvel: `[B, nv]`; base velocity (m/s, rad/s), then joint velocities (rad/s).
+      warmstart: `[B, nv]`; accelerations that the constraint solver starts from.
+    """
+
+    qpos: Any
+    qvel: Any
+    warmstart: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Solver:
+    """Constraint solver settings, chosen for stability first (docs/physics.md).
+
+    Attributes:
+      iterations: Newton iterations a physics step. Brax's 1 is not stable.
+      line_search: line-search iterations a Newton iteration. Brax's 4 is not stable.
+      elliptic: true friction cones. The pyramid follows the world's axes, so it breaks
+        equivalence modulo orientation (Def. 3).
+    """
+
+    iterations: int = 4
+    line_search: int = 8
+    elliptic: bool = True
+
+
+def load(path: epath.Path, solver: Solver) -> mujoco.MjSpec:
+    """A model file with the solver settings put in."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.iterations = solver.iterations
+    spec.option.ls_iterations = solver.line_search
+    cones = mujoco.mjtCone
+    spec.option.cone = cones.mjCONE_ELLIPTIC if solver.elliptic else cones.mjCONE_PYRAMIDAL
+    return spec
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror:
+    """The reflection y → −y of a model, read off its geometry.
+
+    Attributes:
+      bodies: `[nbody]`, for each body the one at its mirror image.
+      hinges: `[nv − 6]`, for each hinge the one at its mirror image.
+      signs: `[nv − 6]`, the sign that angle and torque take on.
+      actuators: `[nu]`, for each actuator the one at its mirror image.
+      actuator_signs: `[nu]`.
+    """
+
+    bodies: list[int]
+    hinges: list[int]
+    signs: list[float]
+    actuators: list[int]
+    actuator_signs: list[float]
+
+
+def _partner(points: np.ndarray, i: int) -> int:
+    distance = np.linalg.norm(points - points[i] * [1, -1, 1], axis=-1)
+    if distance.min() > 1e-6:
+        raise ValueError("the model is not its own mirror image")
+    return int(distance.argmin())
+
+
+def mirror_of(model: mujoco.MjModel) -> Mirror:
+    """Finds the mirror image of every body, hinge and actuator in the rest pose.
+
+    Raises:
+      ValueError: the model is not symmetric in the plane y = 0.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    # Centres of mass tell bodies apart even where their frames coincide.
+    bodies = [_partner(data.xipos, i) for i in range(model.nbody)]
+    hinges, signs = [], []
+    for j in range(1, model.njnt):
+        # As a pseudovector, a hinge's axis keeps its y and turns its x and z.
+        axis = data.xaxis[j] * [-1, 1, -1]
+        body = bodies[model.jnt_bodyid[j]]
+        along = [
+            (k, axis @ data.xaxis[k]) for k in range(1, model.njnt) if model.jnt_bodyid[k] == body
+        ]
+        k, sign = max(along, key=lambda pair: abs(pair[1]))
+        hinges.append(k - 1)
+        signs.append(float(round(sign)))
+    driven = [int(j) - 1 for j in model.actuator_trnid[:, 0]]
+    actuators = [driven.index(hinges[j]) for j in driven]
+    return Mirror(bodies, hinges, signs, actuators, [signs[j] for j in driven])
+
+
+class MjxRobot(Robot):
+    """A robot with a free base on hinges, stepped by MJX.
+
+    Subclasses name the constants of the contract and `healthy_height`, and give
+    `_observe` and `cost`.
+
+    Args:
+      spec: the model.
+      frames: physics steps a control step.
+    """
+
+    healthy_height: tuple[float, float]
+    reset_noise: float = 0.1
+
+    def __init__(self, spec: mujoco.MjSpec, frames: int):
+        self.mj_model = spec.compile()
+        self.frames = frames
+        self._model = mjx.put_model(self.mj_model, impl="jax")
+        self._template = mjx.make_data(self.mj_model, impl="jax")
+        self._rest = self.rest_pose()
+        self.mirror = mirror_of(self.mj_model)
+        self.physics = self._physics_layout()
+        m = self.mirror
+        self.action = Layout(
+            (symmetry.joints("torque", m.actuators, m.actuator_signs, "of full torque"),)
+        )
+
+    def rest_pose(self) -> np.ndarray:
+        """qpos `[nq]` that resets are drawn around."""
+        return self.mj_model.qpos0.astype(np.float32)
+
+    def _physics_layout(self) -> Physics:
+        m = self.mirror
+        angles = symmetry.joints("joint angles", m.hinges, m.signs, "rad")
+        rates = symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s")
+        pose = (symmetry.vector("position"), symmetry.quaternion("orientation"), angles)
+        motion = (symmetry.vector("velocity", "m/s"), symmetry.body_pseudovector("spin"), rates)
+        return Physics(Layout(pose), Layout(motion), Layout(motion))
+
+    def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
+        physics = jax.vmap(self._draw)(keys)
+        return self.place(physics, yaw)
+
+    def _draw(self, key: jax.Array) -> Physics:
+        """gymnasium's start: the rest pose, uniform noise in qpos, Gaussian in qvel."""
+        pose, motion = jax.random.split(key)
+        noise, nq, nv = self.reset_noise, self.mj_model.nq, self.mj_model.nv
+        qpos = jnp.asarray(self._rest) + jax.random.uniform(
+            pose, (nq,), minval=-noise, maxval=noise
+        )
+        # MuJoCo reads a quaternion of any length; the observation needs a unit one.
+        qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
+        qvel = noise * jax.random.normal(motion, (nv,))
+        return Physics(qpos, qvel, jnp.zeros(nv))
+
+    def place(self, physics: Physics, yaw: jax.Array) -> State:
+        contact = jnp.zeros((*yaw.shape, self.mj_model.nbody, 6))
+        state = jax.vmap(self._state)(self.turn_physics(physics, yaw), contact)
+        # A start is not judged: noise may lift a robot out of its healthy height.
+        return state.replace(fallen=jnp.zeros_like(state.fallen))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        physics, contact = jax.vmap(self._advance)(state.physics, action)
+        finite = functools.reduce(
+            jnp.logical_and,
+            [
+                jnp.isfinite(x).all(tuple(range(1, x.ndim)))
+                for x in jax.tree.leaves((physics, contact))
+            ],
+        )
+        after = jax.vmap(self._state)(physics, contact)
+        return select(finite, after, state.replace(diverged=jnp.ones_like(finite)))
+
+    def _advance(self, physics: Physics, action: jax.Array) -> tuple[Physics, jax.Array]:
+        """One robot, one control step: new physics and contact wrenches `[nbody, 6]`."""
+        data = self._template.replace(
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            qacc_warmstart=physics.warmstart,
+            ctrl=jnp.clip(action, -1.0, 1.0),
+        )
+        data = jax.lax.fori_loop(0, self.frames, lambda _, d: mjx.step(self._model, d), data)
+        contact = mjx.rne_postconstraint(self._model, data)._impl.cfrc_ext
+        return Physics(data.qpos, data.qvel, data.qacc_warmstart), contact
+
+    def _state(self, physics: Physics, contact: jax.Array) -> State:
+        height = physics.qpos[2]
+        low, high = self.healthy_height
+        return State(
+            physics=physics,
+            observation=self._observe(physics, contact),
+            position=physics.qpos[:3],
+            heading=symmetry.yaw_of(physics.qpos[3:7]),
+            fallen=(height < low) | (height > high),
+            diverged=jnp.zeros((), bool),
+        )
+
+    def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
+        """s `[S]` of one robot from its physics and contact wrenches `[nbody, 6]`."""
+        raise NotImplementedError
+
+
+def select(mask: jax.Array, yes: Any, no: Any) -> Any:
+    """Lane by lane, the tree `yes` where `mask [B]` holds and `no` elsewhere."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            return jnp.where(mask, a, b)
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(pick, yes, no)

@@ -1,0 +1,131 @@
+"""Scenarios: the paper's test (A.1.3), fixed once and shared by every method."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from genidm.errors import BadInput
+from genidm.robots.base import Robot
+
+
+class Scenarios(flax.struct.PyTreeNode):
+    """Test episodes `[seeds, episodes]`: where each starts, and where it should go.
+
+    Attributes:
+      keys: random keys `[seeds, episodes]` of the starts.
+      yaw: `[seeds, episodes]`, radians, that the start is turned by.
+      target: `[seeds, episodes, 3]`, metres, world frame.
+    """
+
+    keys: Any
+    yaw: Any
+    target: Any
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(seeds, episodes)."""
+        return self.yaw.shape
+
+    def digest(self) -> str:
+        """sha256 over all numbers: equal digests mean equal tests."""
+        h = hashlib.sha256()
+        for x in (jax.random.key_data(self.keys), self.yaw, self.target):
+            h.update(np.ascontiguousarray(x).tobytes())
+        return h.hexdigest()
+
+
+# So that the scenarios of seed n are not the random numbers of a collecting seed n.
+BANK = 0x7E57
+
+
+def scenarios(
+    robot: Robot, seeds: int = 10, episodes: int = 1000, first_seed: int = 0
+) -> Scenarios:
+    """The paper's test: random heading, target 2–5 m away within ±45° of the heading.
+
+    A function of the robot and the seeds alone; more episodes extend the same bank.
+    The target's height is that of a standing robot, so d is three-dimensional.
+
+    Args:
+      robot: sets the target's distance and height.
+      seeds: number of test seeds.
+      episodes: episodes a seed.
+      first_seed: the first of them.
+    """
+    if seeds < 1 or episodes < 1:
+        raise BadInput("a test needs at least one seed and one episode")
+    numbers = jnp.arange(first_seed, first_seed + seeds)
+    return _bank(robot, numbers, jnp.arange(episodes))
+
+
+def _bank(robot: Robot, seeds: jax.Array, episodes: jax.Array) -> Scenarios:
+    def one(seed: jax.Array, episode: jax.Array) -> tuple[jax.Array, ...]:
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(BANK), seed), episode)
+        start, turn, far, side = jax.random.split(key, 4)
+        low, high = robot.target_distance
+        return (
+            start,
+            jax.random.uniform(turn, minval=-jnp.pi, maxval=jnp.pi),
+            jax.random.uniform(far, minval=low, maxval=high),
+            jax.random.uniform(side, minval=-jnp.pi / 4, maxval=jnp.pi / 4),
+        )
+
+    grid = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
+    keys, yaw, distance, bearing = jax.jit(grid)(seeds, episodes)
+    return toward(robot, keys, yaw, distance, bearing)
+
+
+def toward(
+    robot: Robot, keys: jax.Array, yaw: jax.Array, distance: jax.Array, bearing: jax.Array
+) -> Scenarios:
+    """Scenarios with targets at given distances and bearings.
+
+    Args:
+      robot: whose starts they are.
+      keys: `[seeds, episodes]`.
+      yaw: `[seeds, episodes]`, radians, that the start is turned by.
+      distance: `[seeds, episodes]`, metres from the start.
+      bearing: `[seeds, episodes]`, radians to the left of the start's heading.
+    """
+
+    def place(keys: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = robot.reset(keys, yaw)
+        return state.position, state.heading
+
+    flat = [x.reshape(-1) for x in (keys, yaw)]
+    position, heading = jax.jit(place)(*flat)
+    angle = heading.reshape(yaw.shape) + bearing
+    offset = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1) * distance[..., None]
+    level = position.reshape(*yaw.shape, 3)[..., :2] + offset
+    height = jnp.full((*yaw.shape, 1), robot.standing_height)
+    return Scenarios(keys, yaw, jnp.concatenate([level, height], axis=-1))
+
+
+# Fig. 8: ten episodes where the robot starts as it did while it learned, and ten where it
+# faces almost the other way.
+TOUR = 10
+UNSEEN_YAW = 0.75 * np.pi
+
+
+def tours(robot: Robot) -> Scenarios:
+    """The scenarios of Fig. 8, `[2, 10]`: one fixed start each, targets 3–5 m ahead.
+
+    Row 0 starts at yaw 0, as all experience did; row 1 turned by 135°.
+    """
+    low, high = robot.target_distance
+    far = jnp.linspace((low + high) / 2, high, TOUR)
+    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, TOUR)
+    shape = (2, TOUR)
+    return toward(
+        robot,
+        keys=jnp.broadcast_to(jax.random.key(BANK), shape),
+        yaw=jnp.broadcast_to(jnp.asarray([[0.0], [UNSEEN_YAW]]), shape),
+        distance=jnp.broadcast_to(far, shape),
+        bearing=jnp.broadcast_to(side, shape),
+    )

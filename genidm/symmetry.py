@@ -1,0 +1,206 @@
+"""Yaw and mirror symmetry: what a turn of the world, or its reflection, does to numbers.
+
+Everything a robot reports (its state s, its physics, its actions) is a tuple of named
+fields, a `Layout`. Each field says how it transforms when the world is turned by a yaw
+about the vertical (Def. 3, equivalence modulo orientation) and when it is reflected in
+the plane y = 0. All functions are pure and act on arrays `[..., n]`.
+
+The frame is right-handed with z up; angles are in radians; quaternions are (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Array = jax.Array
+
+
+def turn_vector(v: Array, yaw: Array) -> Array:
+    """Vectors `[..., 3]` turned about the vertical by `yaw [...]`."""
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return jnp.stack([c * x - s * y, s * x + c * y, jnp.broadcast_to(z, x.shape)], axis=-1)
+
+
+def turn_quaternion(q: Array, yaw: Array) -> Array:
+    """Orientations `[..., 4]` after the world is turned by `yaw [...]`; w ≥ 0."""
+    c, s = jnp.cos(yaw / 2), jnp.sin(yaw / 2)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return positive(
+        jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
+    )
+
+
+def positive(q: Array) -> Array:
+    """The one of q and −q, the same orientation, that has w ≥ 0."""
+    return jnp.where(q[..., :1] < 0, -q, q)
+
+
+def wrap(angle: Array) -> Array:
+    """Angles brought into [−π, π)."""
+    return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+
+
+def yaw_of(q: Array) -> Array:
+    """Heading `[...]`, in radians, of orientations `[..., 4]`: where the body's x axis points."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def horizontal(v: Array) -> Array:
+    """Length `[...]` of the horizontal part of vectors `[..., 3]`."""
+    return jnp.hypot(v[..., 0], v[..., 1])
+
+
+Turn = Callable[[Array, Array], Array]
+Mirror = Callable[[Array], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """A named run of `size` numbers and how it transforms.
+
+    Attributes:
+      name: what the numbers are; unique in a layout.
+      size: how many there are.
+      kind: how they transform, in a word, for the docs.
+      unit: SI unit of each number.
+      turn: (x [..., size], yaw [...]) → x after the world is turned by yaw.
+      mirror: x [..., size] → x after the reflection y → −y.
+      yaw: x [..., size] → heading [...], for a field that holds one.
+    """
+
+    name: str
+    size: int
+    kind: str
+    unit: str
+    turn: Turn
+    mirror: Mirror
+    yaw: Callable[[Array], Array] | None = None
+
+
+def _signed(signs: Sequence[float], permutation: Sequence[int] | None = None) -> Mirror:
+    factors = np.asarray(signs, np.float32)
+    if permutation is None:
+        return lambda x: x * factors
+    order = np.asarray(permutation)
+    return lambda x: x[..., order] * factors
+
+
+def _keep(x: Array, yaw: Array) -> Array:
+    return x
+
+
+def invariant(name: str, size: int = 1, unit: str = "1") -> Field:
+    """Numbers that neither a turn nor a reflection changes (a height)."""
+    return Field(name, size, "invariant", unit, _keep, lambda x: x)
+
+
+def vector(name: str, unit: str = "m") -> Field:
+    """A vector in the world frame (a position, a linear velocity, a force)."""
+    return Field(name, 3, "vector", unit, turn_vector, _signed([1, -1, 1]))
+
+
+def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
+    """A pseudovector in the body's own frame (MuJoCo's angular velocity of a free joint)."""
+    return Field(name, 3, "pseudovector in the body frame", unit, _keep, _signed([-1, 1, -1]))
+
+
+def quaternion(name: str) -> Field:
+    """An orientation, given with w ≥ 0 because q and −q are one orientation but two inputs."""
+    mirror = _signed([1, -1, 1, -1])
+    return Field(name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of)
+
+
+def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: str) -> Field:
+    """One number a joint: a turn leaves it, a reflection gives it to the joint across.
+
+    Args:
+      name: what the numbers are.
+      permutation: for each joint the index of its mirror image.
+      signs: for each joint the sign that the number takes on.
+      unit: of each number.
+    """
+    mirror = _signed(signs, permutation)
+    return Field(name, len(permutation), "joints", unit, _keep, mirror)
+
+
+def wrenches(name: str, permutation: Sequence[int]) -> Field:
+    """Torque (3) and force (3), in the world frame, on each of several bodies.
+
+    Args:
+      name: what the numbers are.
+      permutation: for each body the index of its mirror image.
+    """
+    count, order = len(permutation), np.asarray(permutation)
+    signs = np.asarray([-1, 1, -1, 1, -1, 1], np.float32)
+
+    def turn(x: Array, yaw: Array) -> Array:
+        parts = x.reshape(*x.shape[:-1], 2 * count, 3)
+        return turn_vector(parts, jnp.asarray(yaw)[..., None]).reshape(x.shape)
+
+    def mirror(x: Array) -> Array:
+        return (x.reshape(*x.shape[:-1], count, 6)[..., order, :] * signs).reshape(x.shape)
+
+    return Field(name, 6 * count, "wrenches", "N·m, N", turn, mirror)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What an array `[..., n]` holds, field by field, and so how it transforms."""
+
+    fields: tuple[Field, ...]
+
+    def __post_init__(self) -> None:
+        names = [f.name for f in self.fields]
+        if len(set(names)) != len(names):
+            raise ValueError(f"a layout names a field twice: {names}")
+
+    @property
+    def size(self) -> int:
+        """Length of the last dimension."""
+        return sum(f.size for f in self.fields)
+
+    def _split(self, x: Array) -> list[Array]:
+        if x.shape[-1] != self.size:
+            raise ValueError(f"expected {self.size} numbers, not {x.shape[-1]}")
+        edges = np.cumsum([f.size for f in self.fields])[:-1]
+        return jnp.split(x, edges, axis=-1)
+
+    def part(self, x: Array, name: str) -> Array:
+        """The field `name` of x `[..., n]`."""
+        return dict(zip((f.name for f in self.fields), self._split(x), strict=True))[name]
+
+    def turn(self, x: Array, yaw: Array) -> Array:
+        """x `[..., n]` after the world is turned by `yaw [...]` about the origin's vertical."""
+        parts = zip(self.fields, self._split(x), strict=True)
+        return jnp.concatenate([f.turn(part, yaw) for f, part in parts], axis=-1)
+
+    def mirror(self, x: Array) -> Array:
+        """x `[..., n]` after the reflection y → −y."""
+        parts = zip(self.fields, self._split(x), strict=True)
+        return jnp.concatenate([f.mirror(part) for f, part in parts], axis=-1)
+
+    def yaw(self, x: Array) -> Array:
+        """The heading `[...]` that x `[..., n]` holds.
+
+        Raises:
+          ValueError: no field of the layout holds a heading.
+        """
+        for f, part in zip(self.fields, self._split(x), strict=True):
+            if f.yaw is not None:
+                return f.yaw(part)
+        raise ValueError("no field of this layout holds a heading")
+
+    def describe(self) -> str:
+        """A Markdown table of the fields."""
+        rows, start = ["| numbers | field | unit | transforms as |", "|---|---|---|---|"], 0
+        for f in self.fields:
+            rows.append(f"| {start}–{start + f.size - 1} | {f.name} | {f.unit} | {f.kind} |")
+            start += f.size
+        return "\n".join(rows)

@@ -1,0 +1,155 @@
+"""Every number of a table, against SciPy or an answer known beforehand."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from genidm import stats
+from genidm.episodes import Episodes
+
+
+def outcome(closest, *, start=None, fell=False, diverged=False, reached=False) -> Episodes:
+    closest = np.asarray(closest, np.float32)
+    return Episodes(
+        closest=closest,
+        start=np.full(closest.shape, 3.0) if start is None else np.asarray(start),
+        reached=np.broadcast_to(reached, closest.shape),
+        fell=np.broadcast_to(fell, closest.shape),
+        diverged=np.broadcast_to(diverged, closest.shape),
+        steps=np.arange(closest.size).reshape(closest.shape),
+        path_length=2 * closest,
+    )
+
+
+def random(seeds=10, episodes=200, shift=0.0, rng=0) -> Episodes:
+    generator = np.random.default_rng(rng)
+    level = generator.normal(1.0, 0.2, (seeds, 1))
+    return outcome(level + shift + generator.gamma(2.0, 0.5, (seeds, episodes)))
+
+
+def test_summary_of_known_episodes():
+    s = stats.summary(outcome([[0.1, 0.25], [0.5, 3.15]], fell=[[0, 0], [0, 1]], reached=[[1, 0]]))
+    assert s["mean"] == pytest.approx(1.0)
+    assert s["std"] == pytest.approx(np.std([0.1, 0.25, 0.5, 3.15]))
+    assert s["success"] == {"0.25": 0.5, "0.5": 0.75, "1.0": 0.75}
+    assert (s["fell"], s["reached"], s["diverged"]) == (0.25, 0.5, 0.0)
+    assert s["steps"] == pytest.approx(1.5)
+    assert (s["seeds"], s["episodes"]) == (2, 2)
+
+
+def test_interval_is_scipys_percentile_bootstrap_of_the_seeds_means():
+    episodes = random()
+    low, high = stats.summary(episodes)["ci95"]
+    means = episodes.closest.astype(float).mean(1)
+    theirs = scipy.stats.bootstrap(
+        (means,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    ).confidence_interval
+    width = theirs.high - theirs.low
+    assert low == pytest.approx(theirs.low, abs=0.05 * width)
+    assert high == pytest.approx(theirs.high, abs=0.05 * width)
+
+
+def test_interval_takes_a_seed_as_one_unit():
+    """Episodes of a seed that are all alike tell no more than one of them."""
+    means = np.array([[0.0], [1.0], [2.0], [4.0]])
+    assert stats.interval(means) == pytest.approx(stats.interval(np.repeat(means, 100, axis=1)))
+
+
+def test_interval_of_one_seed_resamples_its_episodes():
+    values = np.random.default_rng(0).gamma(2.0, 0.5, (1, 400))
+    low, high = stats.interval(values)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(400), rel=0.1)
+    assert low < values.mean() < high
+
+
+def test_interval_is_the_same_every_time():
+    assert stats.interval(random().closest) == stats.interval(random().closest)
+
+
+def test_iqm_is_scipys_trimmed_mean():
+    for n in (1, 3, 4, 5, 7, 101):
+        values = np.random.default_rng(n).exponential(size=n)
+        assert stats.interquartile_mean(values) == pytest.approx(
+            scipy.stats.trim_mean(values, 0.25)
+        )
+    episodes = random()
+    theirs = scipy.stats.trim_mean(episodes.closest.astype(float).ravel(), 0.25)
+    assert stats.summary(episodes)["iqm"] == pytest.approx(theirs)
+
+
+def test_diverged_episodes_are_counted_and_in_no_mean():
+    diverged = [[False, True], [False, False]]
+    s = stats.summary(outcome([[1.0, 0.01], [2.0, 3.0]], diverged=diverged))
+    assert s["diverged"] == 0.25
+    assert s["mean"] == pytest.approx(2.0)
+    assert s["iqm"] == pytest.approx(2.0)
+    assert s["steps"] == pytest.approx((0 + 2 + 3) / 3)
+    assert s["success"]["0.25"] == 0.0, "breaking the physics is no success"
+    nan = stats.summary(outcome([[1.0, np.nan], [2.0, 3.0]], diverged=diverged))
+    assert nan == s, "what a diverged episode holds must not matter"
+
+
+def test_a_seed_that_diverged_throughout_is_left_out_of_the_interval():
+    diverged = [[True, True], [False, False], [False, False]]
+    episodes = outcome([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], diverged=diverged)
+    assert stats.summary(episodes)["ci95"] == pytest.approx([1.0, 2.0])
+
+
+def test_where_all_diverged_there_is_no_mean():
+    s = stats.summary(outcome([[1.0, 2.0]], diverged=True))
+    assert np.isnan([s["mean"], s["std"], s["iqm"], s["steps"], *s["ci95"]]).all()
+    assert s["diverged"] == 1.0
+
+
+@pytest.mark.parametrize("closest", [[1.0, 2.0], [[]], [[1.0, np.nan]], [[1.0, np.inf]]])
+def test_what_are_no_episodes_is_said(closest):
+    with pytest.raises(ValueError, match=r"episodes must be|no finite closest"):
+        stats.summary(outcome(closest))
+
+
+def test_paired_of_known_episodes():
+    a = outcome([[1.0, 2.0], [1.0, 4.0]])
+    b = outcome([[2.0, 2.0], [2.0, 3.0]])
+    p = stats.paired(a, b)
+    assert p["difference"] == pytest.approx(-0.25)
+    assert p["improvement"] == pytest.approx((2 + 0.5) / 4)
+    assert p["ci95"] == pytest.approx([-0.5, 0.0])
+
+
+def test_paired_sees_through_the_scenarios():
+    """A gain of 0.1 m everywhere is certain, however much scenarios differ."""
+    a, b = random(shift=0.0), random(shift=0.1)
+    p = stats.paired(a, b)
+    assert p["ci95"] == pytest.approx([-0.1, -0.1], abs=1e-5)
+    assert p["improvement"] == 1.0
+    assert stats.summary(a)["ci95"][1] > stats.summary(b)["ci95"][0], "unpaired, they overlap"
+
+
+def test_paired_leaves_out_what_either_lost():
+    a = outcome([[1.0, 9.0], [1.0, 1.0]], diverged=[[0, 1], [0, 0]])
+    b = outcome([[2.0, 2.0], [2.0, np.nan]], diverged=[[0, 0], [0, 1]])
+    assert stats.paired(a, b)["difference"] == pytest.approx(-1.0)
+    assert stats.paired(a, b)["improvement"] == 1.0
+
+
+def test_paired_refuses_other_scenarios():
+    a = outcome([[1.0, 2.0]])
+    with pytest.raises(ValueError, match="same scenarios"):
+        stats.paired(a, outcome([[1.0, 2.0, 3.0]]))
+    with pytest.raises(ValueError, match="same scenarios"):
+        stats.paired(a, outcome([[1.0, 2.0]], start=[[3.0, 3.1]]))
+
+
+def test_spread_over_collecting_seeds():
+    runs = [outcome([[1.0, 3.0]]), outcome([[3.0, 3.0]]), outcome([[4.0, 9.0]], diverged=[[0, 1]])]
+    s = stats.spread(runs)
+    assert s["means"] == [2.0, 3.0, 4.0]
+    assert (s["mean"], s["std"]) == (3.0, 1.0)
+    assert np.isnan(stats.spread(runs[:1])["std"])
+
+
+def test_paired_spread_pairs_the_runs_in_order():
+    a, b = [outcome([[1.0]]), outcome([[2.0]])], [outcome([[2.0]]), outcome([[5.0]])]
+    assert stats.paired_spread(a, b)["means"] == [-1.0, -3.0]
+    with pytest.raises(ValueError, match="shorter"):
+        stats.paired_spread(a, b[:1])
