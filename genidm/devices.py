@@ -29,17 +29,22 @@ def configure() -> None:
       (`JAX_COMPILATION_CACHE_DIR` overrides).
     """
     given = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not given and jax.config.read("jax_num_cpu_devices") < 0:
+    if not given and _setting("jax_num_cpu_devices") < 0:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         count = int(os.environ.get("GENIDM_DEVICES", cores or 1))
         with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
             jax.config.update("jax_num_cpu_devices", count)
-    if jax.config.read("jax_default_matmul_precision") is None:
+    if _setting("jax_default_matmul_precision") is None:
         jax.config.update("jax_default_matmul_precision", "highest")
-    if jax.config.read("jax_compilation_cache_dir") is None:
+    if _setting("jax_compilation_cache_dir") is None:
         cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "genidm" / "xla"
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _setting(name: str) -> Any:
+    # jax declares no types for the settings that it adds to `config` one by one.
+    return getattr(jax.config, name)
 
 
 def mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
