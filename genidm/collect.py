@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Agent, place
+from genidm.agents.base import Agent, Learning
 from genidm.errors import BadInput
 from genidm.experience import Experience, concatenate, load
-from genidm.progress import Progress, compiled
+from genidm.progress import Progress
 from genidm.robots.base import Robot
 from genidm.store import Stage
 from genidm.tasks import WalkForward
@@ -53,22 +54,22 @@ def collect(
     mesh = mesh or devices.mesh()
     _check(agent, interactions, mesh)
     learning = agent.learning(robot, task or WalkForward(), mesh)
-    learner = place(jax.jit(learning.start)(jax.random.key(seed)), mesh)
+    learner = learning.place(jax.jit(learning.start)(jax.random.key(seed)))
     size = agent.lanes * agent.unroll
     iterations = -(-interactions // size)
     log = _Log(robot, stage, max(1, CHUNK // size))
-    done, learner = log.resume(learner, mesh)
+    done, learner = log.resume(learner, learning)
     if done == iterations:
         return log.experience(), learner
-    program = compiled(f"{type(agent).__name__} iteration", learning.iterate, learner)
+    iterate = learning.prepare(learner)
     directory = stage.directory if stage else None
     with Progress("collect", iterations * size, "steps", directory, done * size, quiet) as bar:
         for i in range(done, iterations):
-            learner, part, metrics = program(learner)
+            learner, part, metrics = iterate(learner)
             log.add(part)
             if log.full or i + 1 == iterations:
                 log.flush(i + 1, learner)
-            bar.advance(size, **{name: float(x) for name, x in metrics.items()})
+            bar.advance(size, **{name: np.mean(x) for name, x in metrics.items()})
     return log.experience(), learner
 
 
@@ -104,14 +105,14 @@ class _Log:
             state = {"learner": learner, "chunks": len(self.chunks)}
             self.stage.checkpoints().save(iteration, state)
 
-    def resume(self, learner: Any, mesh: Mesh) -> tuple[int, Any]:
+    def resume(self, learner: Any, learning: Learning) -> tuple[int, Any]:
         """Iterations done, and the learner after them."""
         found = self.stage and self.stage.checkpoints().latest({"learner": learner, "chunks": 0})
         if not found:
             return 0, learner
         iteration, tree = found
         self.chunks = [load(self._path(i), self.robot) for i in range(tree["chunks"])]
-        return iteration, place(tree["learner"], mesh)
+        return iteration, learning.place(tree["learner"])
 
     def _path(self, chunk: int) -> Path:
         assert self.stage

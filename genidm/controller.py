@@ -77,13 +77,17 @@ class Controller(flax.struct.PyTreeNode):
         """Unclipped actions of states and directions in the method's frame (Eq. 1, 4)."""
         return self.architecture.action(self.params, self.latent(s, d))
 
-    def save(self, path: Path) -> None:
-        """Writes the controller as a directory, without pickle."""
+    def save(self, path: Path, overwrite: bool = False) -> None:
+        """Writes the controller as a directory, without pickle.
+
+        Raises:
+          BadInput: there is something already, and `overwrite` is not set.
+        """
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
         meta = {"robot": self.robot.name, "frame": self.frame} | store.plain(self.architecture)
-        store.save_arrays(path, leaves, meta)
+        store.save_arrays(path, leaves, meta, overwrite)
 
 
 def load(path: Path, robot: Robot) -> Controller:

@@ -67,9 +67,9 @@ def put(tree: Any, mesh: Mesh, axis: int | None = 0) -> Any:
     return jax.device_put(tree, NamedSharding(mesh, spec(axis)))
 
 
-def constrain(tree: Any, mesh: Mesh, axis: int | None = 0) -> Any:
-    """Inside jit: keeps a tree of arrays sharded along `axis` (None: copied)."""
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, spec(axis)))
+def gather(tree: Any, mesh: Mesh) -> Any:
+    """Moves a tree of arrays, wherever its parts lie, whole to the mesh's first device."""
+    return jax.device_put(tree, mesh.devices.flat[0])
 
 
 def over_lanes(

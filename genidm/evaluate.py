@@ -21,11 +21,10 @@ from genidm import devices
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.progress import Progress, compiled
-from genidm.robots.base import Robot, State
+from genidm.robots.base import Robot, State, select
 from genidm.scenarios import Scenarios
 from genidm.store import Stage
 from genidm.symmetry import horizontal
-from genidm.tasks import select
 
 # (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled
 # program serves every controller of the same shape.
@@ -146,7 +145,8 @@ def run(
     """
     settings, mesh = settings or Test(), mesh or devices.mesh()
     queue, shares = _queues(robot, bank, settings, traced, mesh)
-    checkpoints = stage.checkpoints() if stage else None
+    # Its queues belong to the devices: with another number of them the test begins anew.
+    checkpoints = stage.checkpoints(f"{mesh.size}_devices") if stage else None
     found = checkpoints.latest(queue) if checkpoints else None
     calls, queue = (found[0], devices.put(found[1], mesh)) if found else (0, queue)
     controller = devices.put(controller, mesh, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,9 @@ class Experience(flax.struct.PyTreeNode):
 
     def save(self, path: Path) -> None:
         """Writes the record as a directory of arrays, without pickle."""
-        store.save_arrays(path, flax.serialization.to_state_dict(self), {}, overwrite=True)
+        tree = flax.serialization.to_state_dict(self)
+        there = {name: x for name, x in tree.items() if x is not None}
+        store.save_arrays(path, there, {}, overwrite=True)
 
     def check(self, state_size: int, action_size: int) -> None:
         """Refuses a record that cannot be learned from.
@@ -66,12 +69,16 @@ class Experience(flax.struct.PyTreeNode):
           BadInput: the shapes do not fit together or the robot, or numbers are not finite.
         """
         lanes = self.first.shape
-        for name, size in (("s", state_size), ("o", 3), ("o_next", 3), ("a", action_size)):
-            x = getattr(self, name)
-            if x.shape != (*lanes, size):
-                raise BadInput(f"experience: {name} has shape {x.shape}, not {(*lanes, size)}")
-            if not np.isfinite(x).all():
+        sizes = {"s": (state_size,), "o": (3,), "o_next": (3,), "a": (action_size,)}
+        for name, size in (sizes | {"last": (), "valid": ()}).items():
+            shape = np.shape(getattr(self, name))
+            if shape != (*lanes, *size):
+                raise BadInput(f"experience: {name} has shape {shape}, not {(*lanes, *size)}")
+        for name in (*sizes, "physics"):
+            if not all(np.isfinite(x).all() for x in jax.tree.leaves(getattr(self, name))):
                 raise BadInput(f"experience: {name} holds NaN or infinity")
+        if any(x.shape[:2] != lanes for x in jax.tree.leaves(self.physics)):
+            raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
 
 
 def record(step: Step) -> Experience:
@@ -100,12 +107,17 @@ def load(path: Path, robot: Robot) -> Experience:
       BadInput: the directory is torn, or the record is another robot's.
     """
     tree, _ = store.load_arrays(path)
-    physics = tree.pop("physics", None)
-    if physics is not None:
-        physics = flax.serialization.from_state_dict(robot.physics, physics)
-    experience = Experience(**tree, physics=physics)
+    if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
+        raise BadInput(f"{path} holds no experience")
+    experience = Experience(**tree)
     experience.check(robot.observation.size, robot.action.size)
-    return experience
+    if experience.physics is None:
+        return experience
+    try:
+        physics = flax.serialization.from_state_dict(robot.physics, experience.physics)
+    except ValueError:
+        raise BadInput(f"{path} holds the physics of another robot than {robot.name}") from None
+    return experience.replace(physics=physics)
 
 
 def load_chunks(directory: Path, robot: Robot) -> Experience:

@@ -203,7 +203,7 @@ class Cell:
                 self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
             )
             model = fit(self.robot, samples, self._key(2), self._fit, frame=m.frame, stage=stage)
-            model.save(stage.path("controller"))
+            model.save(stage.path("controller"), overwrite=True)
             stage.finish(
                 {
                     "robot": self.robot.name,

@@ -24,8 +24,7 @@ from genidm import devices, store, symmetry
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
 from genidm.progress import Progress, compiled
-from genidm.robots.base import Robot, State
-from genidm.tasks import select
+from genidm.robots.base import Robot, State, select
 
 Mode = Literal["segments", "episodes", "rotate"]
 
@@ -128,16 +127,18 @@ def replay(
       quiet: no progress bar.
 
     Raises:
-      BadInput: the record holds no physics and the mode needs it.
+      BadInput: the record is unusable, or holds no physics and the mode needs it.
     """
     settings = settings or Generalize()
+    experience.check(robot.observation.size, robot.action.size)
     if settings.mode == "rotate":
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
     placed = _placements(np.asarray(experience.first), settings)
-    blocks = _Blocks(experience, placed, settings)
-    run = _Runner(robot, mesh or devices.mesh(), blocks.example(key))
+    mesh = mesh or devices.mesh()
+    blocks = _Blocks(experience, placed, settings, mesh.size)
+    run = _Runner(robot, mesh, blocks.example(key))
     copies = []
     with Progress("generalize", settings.copies * blocks.total, "steps", quiet=quiet) as bar:
         for copy_key in jax.random.split(key, settings.copies):
@@ -184,7 +185,9 @@ class _Blocks:
     In mode "episodes" the columns are the record's lanes, and blocks follow one another.
     """
 
-    def __init__(self, experience: Experience, placed: np.ndarray, settings: Generalize):
+    def __init__(
+        self, experience: Experience, placed: np.ndarray, settings: Generalize, devices: int
+    ):
         steps, lanes = placed.shape
         self.length = settings.segment
         self.shape = (-(-steps // self.length), lanes)
@@ -192,7 +195,7 @@ class _Blocks:
         self.follow = settings.mode == "episodes"
         count = self.shape[0] * lanes
         width = lanes if self.follow else min(settings.lanes, count)
-        self.width = -(-width // jax.device_count()) * jax.device_count()
+        self.width = -(-width // devices) * devices
         source = dict(
             physics=experience.physics, s=experience.s, a=experience.a,
             placed=placed, valid=experience.valid,
@@ -266,7 +269,9 @@ class _Runner:
         cursor = None
         for i, block in enumerate(blocks):
             if cursor is None or not blocks.follow:
-                keys = jax.random.split(jax.random.fold_in(key, i), blocks.width)
+                # A column's key is its own, however wide the blocks are.
+                columns = i * blocks.width + np.arange(blocks.width)
+                keys = jax.vmap(jax.random.fold_in, (None, 0))(key, columns)
                 cursor = self._start(keys, block)
             cursor, out = self.program(cursor, self._put(block))
             outputs.append(jax.tree.map(np.asarray, out))
@@ -315,11 +320,11 @@ def residual(experience: Experience, turned: Replay, steps: int = 200) -> dict[s
     distance = np.linalg.norm(np.asarray(exact) - turned.o_next, axis=-1)
     since = np.arange(distance.shape[1])[:, None] - turned.start
     rows = []
-    for step in range(min(steps, int(since.max()) + 1)):
-        there = np.broadcast_to(since == step, distance.shape) & turned.valid
+    for n in range(min(steps, int(since.max()) + 1)):
+        there = np.broadcast_to(since == n, distance.shape) & turned.valid
         if there.any():
-            rows.append((step + 1, *np.quantile(distance[there], [0.5, 0.9])))
-    step, median, p90 = np.asarray(rows, np.float64).T
+            rows.append((n + 1, *np.quantile(distance[there], [0.5, 0.9])))
+    step, median, p90 = np.asarray(rows, np.float64).reshape(-1, 3).T
     return {"step": step, "median": median, "p90": p90}
 
 
@@ -372,6 +377,7 @@ def _goal(copy: Replay, goal: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     replayed = np.take_along_axis(copy.o_next, goal[..., None], axis=0)
     exact = np.asarray(symmetry.turn_vector(jnp.asarray(ahead), jnp.asarray(copy.yaw)))
     in_one_piece = np.take_along_axis(copy.start, goal, axis=0) == copy.start
+    in_one_piece &= np.take_along_axis(copy.valid, goal, axis=0)
     return np.where(in_one_piece[..., None], replayed, exact)
 
 

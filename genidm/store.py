@@ -485,7 +485,7 @@ class Stage:
         except Torn:
             save_json(stage.path("config.json"), {"config": config, "environment": here})
             return stage
-        if begun != here and not stage.done and stage.checkpoints().steps():
+        if begun != here and not stage.done and stage.path("checkpoints").exists():
             other = ", ".join(f"{k} {begun.get(k)}" for k in here if begun.get(k) != here[k])
             change = f"{stage.directory} was begun elsewhere ({other})"
             print(f"warning: {change}; bits may differ from one machine's", file=sys.stderr)
@@ -511,9 +511,9 @@ class Stage:
         """Where the stage keeps the file or directory `name`."""
         return self.directory / name
 
-    def checkpoints(self) -> Checkpoints:
-        """Its checkpoints, while it is under way."""
-        return Checkpoints(self.path("checkpoints"))
+    def checkpoints(self, part: str = "") -> Checkpoints:
+        """Its checkpoints, while it is under way; `part` names those of one kind."""
+        return Checkpoints(self.path("checkpoints") / part)
 
     def clear_checkpoints(self) -> None:
         """Removes them."""

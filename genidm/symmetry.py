@@ -24,7 +24,8 @@ def turn_vector(v: Array, yaw: Array) -> Array:
     """Vectors `[..., 3]` turned about the vertical by `yaw [...]`."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return jnp.stack([c * x - s * y, s * x + c * y, jnp.broadcast_to(z, x.shape)], axis=-1)
+    ahead, left = c * x - s * y, s * x + c * y
+    return jnp.stack([ahead, left, jnp.broadcast_to(z, ahead.shape)], axis=-1)
 
 
 def turn_quaternion(q: Array, yaw: Array) -> Array:

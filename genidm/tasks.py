@@ -13,8 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from genidm.robots.base import Robot, State
-from genidm.robots.mjx import select
+from genidm.robots.base import Robot, State, select
 
 
 class Lanes(flax.struct.PyTreeNode):
@@ -96,6 +95,17 @@ class WalkForward:
         )
         going = Lanes(after, lanes.age + 1, lanes.keys)
         return select(last, self.start(robot, lanes.keys), going), step
+
+
+def metrics(robot: Robot, step: Step) -> dict[str, jax.Array]:
+    """What is worth a learning curve, `[B]` each: forward speed in m/s, reward, falls."""
+    forward = step.after.position[:, 0] - step.before.position[:, 0]
+    return {
+        "reward": step.reward,
+        "speed": forward / robot.control_step,
+        "falls": 1.0 * step.after.fallen,
+        "diverged": 1.0 * step.after.diverged,
+    }
 
 
 def split(lanes: Lanes) -> tuple[Lanes, Any]:

@@ -8,23 +8,28 @@ from typing import Any, NamedTuple, Protocol
 import jax
 from jax.sharding import Mesh
 
-from genidm import devices
 from genidm.experience import Experience
 from genidm.robots.base import Robot
 from genidm.tasks import WalkForward
 
+Metrics = dict[str, jax.Array]
+Iterate = Callable[[Any], tuple[Any, Experience, Metrics]]
+
 
 class Learning(NamedTuple):
-    """An agent at work on a robot: two jitted programs.
+    """An agent at work on a robot.
 
     Attributes:
-      start: key → learner, a tree of arrays that holds all there is to resume from.
-      iterate: learner → (learner, Experience `[unroll, lanes, ...]`, scalar metrics).
-        The learner is donated.
+      start: key → learner: a tree of arrays that holds all there is to resume from.
+      place: learner → the same learner on its devices, from wherever it was.
+      prepare: learner → `iterate`: compiles the agent's programs for a placed learner.
+        `iterate` takes a learner, which it donates, to (learner, Experience
+        `[unroll, lanes, ...]` on the devices, metrics).
     """
 
     start: Callable[[jax.Array], Any]
-    iterate: Callable[[Any], tuple[Any, Experience, dict[str, jax.Array]]]
+    place: Callable[[Any], Any]
+    prepare: Callable[[Any], Iterate]
 
 
 class Agent(Protocol):
@@ -41,9 +46,4 @@ class Agent(Protocol):
     def unroll(self) -> int: ...
 
     def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
-        """The agent's programs for this robot, its lanes sharded over the mesh."""
-
-
-def place(learner: Any, mesh: Mesh) -> Any:
-    """Moves a learner onto the mesh: its lanes shared out, all else on every device."""
-    return devices.put(learner, mesh, None).replace(lanes=devices.put(learner.lanes, mesh))
+        """The agent on this robot, its lanes sharded over the mesh."""

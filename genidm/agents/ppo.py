@@ -1,11 +1,11 @@
 """PPO (Schulman et al. 2017), composed from Brax's networks, losses and statistics.
 
-One iteration, one program: every lane walks `unroll` steps, the running statistics take
-the new states in, and the networks learn from the batch in `epochs` passes. Lanes are
-stepped device by device. The updates are made on every device alike, on the whole batch:
-networks this small learn faster than their gradients could be averaged (measured on four
-CPU devices: 0.28 s an iteration instead of 0.60), and what is learned does not depend on
-the number of devices.
+An iteration is two programs. In the first every device steps its own lanes; in the second
+the running statistics take the new states in, and the networks learn from the batch in
+`epochs` passes, on one device: networks this small learn faster than their gradients could
+be averaged (four CPU devices: 0.3 s an iteration instead of 0.6), what is learned does not
+depend on the number of devices, and no program waits for another device, which XLA's
+collectives on a CPU can do forever when cores are scarce.
 """
 
 from __future__ import annotations
@@ -28,23 +28,31 @@ from flax import linen
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Learning
+from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.errors import BadInput
 from genidm.experience import Experience, record
+from genidm.progress import compiled
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Step, WalkForward, split
+from genidm.tasks import Lanes, Step, WalkForward, metrics, split
 
 # Of what Brax's loss reports, what is worth a curve.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
+
+
+class Mind(flax.struct.PyTreeNode):
+    """What learns: networks, their optimizer, the statistics of the states, a key."""
+
+    params: PPONetworkParams
+    optimizer: Any
+    statistics: RunningStatisticsState
+    key: jax.Array
 
 
 class Learner(flax.struct.PyTreeNode):
     """All that PPO carries from one iteration to the next."""
 
     lanes: Lanes
-    params: PPONetworkParams
-    optimizer: Any
-    statistics: RunningStatisticsState
-    key: jax.Array
+    mind: Mind
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +89,13 @@ class PPO:
     value_hidden: tuple[int, ...] = (64, 64)
     max_gradient: float = 1.0
 
+    def __post_init__(self) -> None:
+        if min(self.lanes, self.unroll, self.epochs, self.minibatches) < 1:
+            raise BadInput("PPO needs lanes, unroll, epochs and minibatches of at least 1")
+        if self.lanes % self.minibatches:
+            uneven = f"{self.lanes} lanes cannot be shared among {self.minibatches} minibatches"
+            raise BadInput(f"{uneven} evenly")
+
     def networks(self, robot: Robot) -> ppo_networks.PPONetworks:
         """Brax's policy and value networks on normalised states."""
         return ppo_networks.make_ppo_networks(
@@ -99,10 +114,8 @@ class PPO:
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
         )
-        rollout = devices.over_lanes(
-            functools.partial(_rollout, robot, task, networks, self.unroll),
-            mesh, [None, None, 0], (0, 1),
-        )  # fmt: skip
+        walk = functools.partial(_walk, robot, task, networks, self.unroll)
+        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
         learn = functools.partial(self._learn, networks, optimizer)
 
         def start(key: jax.Array) -> Learner:
@@ -112,31 +125,47 @@ class PPO:
             )
             return Learner(
                 lanes=task.start(robot, jax.random.split(lanes, self.lanes)),
-                params=params,
-                optimizer=optimizer.init(params),
-                statistics=running_statistics.init_state(jnp.zeros(robot.observation.size)),
-                key=stream,
+                mind=Mind(
+                    params=params,
+                    optimizer=optimizer.init(params),
+                    statistics=running_statistics.init_state(jnp.zeros(robot.observation.size)),
+                    key=stream,
+                ),
             )
 
-        def iterate(learner: Learner) -> tuple[Learner, Experience, dict[str, jax.Array]]:
-            lanes, (steps, choices) = rollout(
-                learner.statistics, learner.params.policy, learner.lanes
-            )
-            batch = devices.constrain(_transitions(steps, choices), mesh, axis=None)
-            learner, losses = learn(learner.replace(lanes=lanes), batch)
-            return learner, record(steps), _metrics(robot, steps) | losses
+        def place(learner: Learner) -> Learner:
+            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.mind, mesh))
 
-        return Learning(start, jax.jit(iterate, donate_argnums=0))
+        def policy(mind: Mind) -> tuple[RunningStatisticsState, Any]:
+            return devices.put((mind.statistics, mind.params.policy), mesh, None)
+
+        def prepare(learner: Learner) -> Iterate:
+            args = (*policy(learner.mind), learner.lanes)
+            step = compiled("PPO's stepping", jax.jit(sharded, donate_argnums=2), *args)
+            batch = jax.eval_shape(sharded, *args)[2]
+            update = compiled(
+                "PPO's learning", jax.jit(learn, donate_argnums=0), learner.mind, batch
+            )
+
+            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
+                lanes, experience, batch, seen = step(*policy(learner.mind), learner.lanes)
+                mind, losses = update(learner.mind, devices.gather(batch, mesh))
+                return Learner(lanes, mind), experience, seen | losses
+
+            return iterate
+
+        return Learning(start, place, prepare)
 
     def _learn(
         self,
         networks: ppo_networks.PPONetworks,
         optimizer: optax.GradientTransformation,
-        learner: Learner,
+        mind: Mind,
         batch: Transition,
-    ) -> tuple[Learner, dict[str, jax.Array]]:
-        """`epochs` passes over a batch `[lanes, unroll, ...]`, in shuffled minibatches."""
-        statistics = running_statistics.update(learner.statistics, batch.observation)
+    ) -> tuple[Mind, Metrics]:
+        """`epochs` passes over a batch `[unroll, lanes, ...]`, in shuffled minibatches."""
+        batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
+        statistics = running_statistics.update(mind.statistics, batch.observation)
         loss = functools.partial(
             compute_ppo_loss,
             ppo_network=networks,
@@ -161,15 +190,14 @@ class PPO:
                 minibatch, carry, (parts, jax.random.split(noise, self.minibatches))
             )
 
-        key, stream = jax.random.split(learner.key)
+        key, stream = jax.random.split(mind.key)
         (params, state), info = jax.lax.scan(
-            epoch, (learner.params, learner.optimizer), jax.random.split(stream, self.epochs)
+            epoch, (mind.params, mind.optimizer), jax.random.split(stream, self.epochs)
         )
-        learner = learner.replace(params=params, optimizer=state, statistics=statistics, key=key)
-        return learner, {name: info[name].mean() for name in LOSSES}
+        return Mind(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
 
 
-def _rollout(
+def _walk(
     robot: Robot,
     task: WalkForward,
     networks: ppo_networks.PPONetworks,
@@ -177,11 +205,11 @@ def _rollout(
     statistics: RunningStatisticsState,
     policy: Any,
     lanes: Lanes,
-) -> tuple[Lanes, tuple[Step, dict[str, jax.Array]]]:
-    """`unroll` steps of every lane under the policy's own noise; outputs `[unroll, B]`."""
+) -> tuple[Lanes, Experience, Transition, Metrics]:
+    """`unroll` steps of every lane under the policy's own noise; outputs `[unroll, B, ...]`."""
     distribution = networks.parametric_action_distribution
 
-    def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Step, dict[str, jax.Array]]]:
+    def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Transition, Metrics]]:
         lanes, keys = split(lanes)
         logits = networks.policy_network.apply(statistics, policy, lanes.robots.observation)
         raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
@@ -190,39 +218,30 @@ def _rollout(
             "raw_action": raw,
             "log_prob": distribution.log_prob(logits, raw),
         }
-        lanes, transition = task.advance(robot, lanes, distribution.postprocess(raw))
-        return lanes, (transition, choice)
+        lanes, seen = task.advance(robot, lanes, distribution.postprocess(raw))
+        return lanes, (record(seen), transition(seen, choice), metrics(robot, seen))
 
-    return jax.lax.scan(step, lanes, length=unroll)
+    lanes, (experience, batch, seen) = jax.lax.scan(step, lanes, length=unroll)
+    # The loss reads no next state but the one after the last step.
+    batch = batch._replace(next_observation=batch.next_observation[-1:])
+    return lanes, experience, batch, seen
 
 
-def _transitions(steps: Step, choices: dict[str, jax.Array]) -> Transition:
-    """What Brax's loss reads, `[lanes, unroll, ...]`."""
-    transition = Transition(
-        observation=steps.before.observation,
-        action=steps.action,
-        reward=steps.reward,
-        discount=1.0 - steps.terminal,
-        # The loss reads no next state but the one after the last step.
-        next_observation=steps.after.observation[-1:],
+def transition(step: Step, choice: dict[str, jax.Array]) -> Transition:
+    """What Brax's loss reads of a step `[B]` and of how its action was chosen."""
+    return Transition(
+        observation=step.before.observation,
+        action=step.action,
+        reward=step.reward,
+        discount=1.0 - step.terminal,
+        next_observation=step.after.observation,
         extras={
-            "policy_extras": choices,
-            "state_extras": {"truncation": 1.0 * (steps.last & ~steps.terminal)},
+            "policy_extras": choice,
+            "state_extras": {"truncation": 1.0 * (step.last & ~step.terminal)},
         },
     )
-    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transition)
 
 
 def _shuffled(batch: Any, order: jax.Array, parts: int) -> Any:
     """A batch `[B, ...]` in the given order, as `[parts, B / parts, ...]`."""
     return jax.tree.map(lambda x: x[order].reshape(parts, -1, *x.shape[1:]), batch)
-
-
-def _metrics(robot: Robot, steps: Step) -> dict[str, jax.Array]:
-    forward = steps.after.position[..., 0] - steps.before.position[..., 0]
-    return {
-        "reward": steps.reward.mean(),
-        "speed": forward.mean() / robot.control_step,
-        "falls": steps.after.fallen.mean(),
-        "diverged": steps.after.diverged.sum(),
-    }

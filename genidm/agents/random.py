@@ -10,10 +10,11 @@ import jax
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Learning
-from genidm.experience import record
+from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.experience import Experience, record
+from genidm.progress import compiled
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, WalkForward, split
+from genidm.tasks import Lanes, WalkForward, metrics, split
 
 
 class Learner(flax.struct.PyTreeNode):
@@ -40,18 +41,22 @@ class RandomActions:
         def step(lanes: Lanes, _: None) -> tuple[Lanes, Any]:
             lanes, keys = split(lanes)
             lanes, transition = task.advance(robot, lanes, draw(keys))
-            return lanes, (record(transition), transition.reward)
+            return lanes, (record(transition), metrics(robot, transition))
 
-        def rollout(lanes: Lanes) -> tuple[Lanes, Any]:
+        def walk(lanes: Lanes) -> tuple[Lanes, Any]:
             return jax.lax.scan(step, lanes, length=self.unroll)
 
         def start(key: jax.Array) -> Learner:
             return Learner(task.start(robot, jax.random.split(key, self.lanes)))
 
-        def iterate(learner: Learner) -> tuple[Learner, Any, dict[str, jax.Array]]:
-            sharded = devices.over_lanes(rollout, mesh, [0], (0, 1))
-            lanes, (experience, reward) = sharded(learner.lanes)
-            metrics = {"reward": reward.mean(), "diverged": (~experience.valid).sum()}
-            return Learner(lanes), experience, metrics
+        def prepare(learner: Learner) -> Iterate:
+            sharded = jax.jit(devices.over_lanes(walk, mesh, [0], (0, 1)), donate_argnums=0)
+            program = compiled("random stepping", sharded, learner.lanes)
 
-        return Learning(start, jax.jit(iterate, donate_argnums=0))
+            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
+                lanes, (experience, seen) = program(learner.lanes)
+                return Learner(lanes), experience, seen
+
+            return iterate
+
+        return Learning(start, lambda learner: devices.put(learner, mesh), prepare)

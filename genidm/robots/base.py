@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 from genidm.symmetry import Layout
 
@@ -94,3 +95,14 @@ class Robot(abc.ABC):
     def mirror_physics(self, physics: Any) -> Any:
         """Physics after the reflection y → −y."""
         return jax.tree.map(lambda layout, x: layout.mirror(x), self.physics, physics)
+
+
+def select(mask: jax.Array, yes: Any, no: Any) -> Any:
+    """Lane by lane, the tree `yes` where `mask [B]` holds and `no` elsewhere."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            return jnp.where(mask, a, b)
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(pick, yes, no)

@@ -16,7 +16,7 @@ from etils import epath
 from mujoco import mjx
 
 from genidm import symmetry
-from genidm.robots.base import Robot, State
+from genidm.robots.base import Robot, State, select
 from genidm.symmetry import Layout
 
 ASSETS = epath.Path(brax.__file__).parent / "envs" / "assets"
@@ -215,14 +215,3 @@ class MjxRobot(Robot):
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         """s `[S]` of one robot from its physics and contact wrenches `[nbody, 6]`."""
         raise NotImplementedError
-
-
-def select(mask: jax.Array, yes: Any, no: Any) -> Any:
-    """Lane by lane, the tree `yes` where `mask [B]` holds and `no` elsewhere."""
-
-    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
-        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-            return jnp.where(mask, a, b)
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
-
-    return jax.tree.map(pick, yes, no)

@@ -1,0 +1,27 @@
+"""What all tests share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+# Read when genidm is imported, so set before it: two devices, for tests that compare
+# `devices.mesh(jax.devices()[:1])` with `devices.mesh()`.
+os.environ["GENIDM_DEVICES"] = "2"
+
+import jax
+import pytest
+
+from genidm.robots import Ant
+
+
+@pytest.fixture(scope="session")
+def ant() -> Ant:
+    return Ant()
+
+
+@pytest.fixture
+def strict_ranks() -> Iterator[None]:
+    """Makes it an error that arrays of unlike rank meet, as `x [B, n]` and `yaw [B]` must not."""
+    with jax.numpy_rank_promotion("raise"):
+        yield

@@ -1,0 +1,388 @@
+"""The Ant against MuJoCo in C on the same model, and its resets, falls and fresh starts."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from genidm import symmetry
+from genidm.robots import Ant, State
+from genidm.robots.mjx import Physics, mirror_of
+from genidm.symmetry import Layout
+from genidm.tasks import Lanes, Step, WalkForward
+
+LANES = 32
+
+
+# ── MuJoCo in C ─────────────────────────────────────────────────────────────────────────────
+
+
+def step_in_c(ant: Ant, physics: Physics, actions: np.ndarray) -> tuple[Physics, np.ndarray]:
+    """Control steps in float64: physics `[B, ...]` after them, and wrenches `[B, nbody, 6]`.
+
+    Args:
+      ant: whose model.
+      physics: before.
+      actions: `[T, B, A]`.
+    """
+    data, lanes = mujoco.MjData(ant.mj_model), []
+    for lane in range(actions.shape[1]):
+        mujoco.mj_resetData(ant.mj_model, data)
+        data.qpos, data.qvel = physics.qpos[lane], physics.qvel[lane]
+        data.qacc_warmstart = physics.warmstart[lane]
+        for action in actions[:, lane]:
+            data.ctrl = action
+            mujoco.mj_step(ant.mj_model, data, ant.frames)
+        mujoco.mj_rnePostConstraint(ant.mj_model, data)
+        lanes.append([data.qpos, data.qvel, data.qacc_warmstart, data.cfrc_ext])
+        lanes[-1] = [x.copy() for x in lanes[-1]]
+        assert data.time == pytest.approx(len(actions) * ant.control_step)  # not reset on the way
+    *after, contact = map(np.stack, zip(*lanes, strict=True))
+    return Physics(*after), contact
+
+
+def observed_in_c(physics: Physics, contact: np.ndarray) -> np.ndarray:
+    """s `[B, 111]` as A.1.1 and the class's docstring put it, number by number."""
+    rows = []
+    for qpos, qvel, wrenches in zip(physics.qpos, physics.qvel, contact, strict=True):
+        quaternion = qpos[3:7] if qpos[3] >= 0 else -qpos[3:7]
+        clipped = wrenches.copy()
+        for part in clipped.reshape(-1, 3):
+            part[:2] /= max(1.0, np.hypot(part[0], part[1]))
+            part[2] = np.clip(part[2], -1, 1)
+        rows.append(np.concatenate([qpos[2:3], quaternion, qpos[7:], qvel, clipped.ravel()]))
+    return np.stack(rows)
+
+
+def positive_w(physics: Physics) -> Physics:
+    """q and −q are one orientation: the one that the layouts give."""
+    sign = np.where(physics.qpos[:, 3:4] < 0, -1.0, 1.0)
+    qpos = np.asarray(physics.qpos).copy()
+    qpos[:, 3:7] *= sign
+    return Physics(qpos, np.asarray(physics.qvel), np.asarray(physics.warmstart))
+
+
+def assert_close(x: Any, y: Any, **tolerance: float) -> None:
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), x, y)
+
+
+@pytest.fixture(scope="module")
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def starts(ant: Ant, rng: np.random.Generator) -> Physics:
+    """Physics `[B, ...]` in the middle of random episodes: standing, hopping, sliding."""
+    qpos = np.tile(ant.rest_pose().astype(float), (LANES, 1))
+    qpos += rng.uniform(-0.1, 0.1, qpos.shape)
+    nv = ant.mj_model.nv
+    physics = Physics(qpos, 0.1 * rng.normal(size=(LANES, nv)), np.zeros((LANES, nv)))
+    strength = rng.uniform(0, 1, (LANES, 1))  # the weak stay on their feet, the strong fly
+    physics, _ = step_in_c(ant, physics, strength * rng.choice([-1.0, 1.0], (20, LANES, 8)))
+    # Numbers that float32 holds too: what differs later is the stepping alone.
+    return jax.tree.map(lambda x: x.astype(np.float32).astype(float), positive_w(physics))
+
+
+@pytest.fixture(scope="module")
+def robot(ant: Ant) -> Ant:
+    """The Ant with compiled functions: one program for all of this file's steps."""
+    robot = copy.copy(ant)
+    robot.step, robot.reset = jax.jit(ant.step), jax.jit(ant.reset)  # type: ignore[method-assign]
+    return robot
+
+
+def placed(robot: Ant, physics: Physics) -> State:
+    physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), physics)
+    return robot.place(physics, jnp.zeros(LANES))
+
+
+# ── (a) against C ───────────────────────────────────────────────────────────────────────────
+
+
+def test_state_is_read_as_in_c(robot: Ant, starts: Physics) -> None:
+    state = placed(robot, starts)
+    expected = observed_in_c(starts, np.zeros((LANES, robot.mj_model.nbody, 6)))
+    assert_close(state.observation, expected, atol=1e-6)
+    assert_close(state.position, starts.qpos[:, :3], atol=0)
+    body = Rotation.from_quat(starts.qpos[:, 3:7], scalar_first=True)
+    assert_close(state.heading, body.as_euler("ZYX")[:, 0], atol=1e-5)
+
+
+def test_next_state_is_that_of_c(robot: Ant, starts: Physics, rng: np.random.Generator) -> None:
+    actions = rng.uniform(-1, 1, (LANES, 8)).astype(np.float32)
+    after, contact = step_in_c(robot, starts, actions[None])
+    touching = np.abs(contact).max((1, 2)) > 0
+    assert touching.sum() >= LANES // 3  # or the wrenches would be compared with nothing
+    assert not contact[:, 0].any()  # MuJoCo gives the world body none
+
+    state = robot.step(placed(robot, starts), jnp.asarray(actions))
+    assert not state.diverged.any()
+    after = positive_w(after)
+    assert_close(positive_w(state.physics).qpos, after.qpos, atol=1e-4)
+    assert_close(state.physics.qvel, after.qvel, atol=3e-3)
+    assert_close(state.physics.warmstart, after.warmstart, atol=0.1, rtol=1e-3)
+    expected = observed_in_c(after, contact)
+    assert_close(state.observation, expected, atol=3e-3)
+    # A few lanes touch down or slip within the step and feel the rounding; most do not.
+    error = np.abs(np.asarray(state.observation) - expected).max(-1)
+    assert np.median(error) < 5e-5
+    assert np.array_equal(state.fallen, (after.qpos[:, 2] < 0.2) | (after.qpos[:, 2] > 1.0))
+
+
+# ── (b) yaw and mirror against C ────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def episode(starts: Physics, ant: Ant, rng: np.random.Generator) -> tuple[Any, ...]:
+    """20 control steps from `starts`: actions, physics after them, wrenches."""
+    actions = rng.uniform(-1, 1, (20, LANES, 8))
+    return actions, *step_in_c(ant, starts, actions)
+
+
+def wrenches(ant: Ant) -> Layout:
+    return Layout((ant.observation.fields[-1],))
+
+
+def assert_commutes(ant: Ant, starts: Physics, episode: tuple[Any, ...], change: Any) -> None:
+    """Steps in C from the changed start, and compares with the changed outcome.
+
+    Args:
+      ant: the robot.
+      starts: physics before.
+      episode: what the fixture gives.
+      change: (layout, x) → x as the layout transforms it.
+    """
+    actions, after, contact = episode
+    with jax.enable_x64(True):
+        on = lambda layout, x: np.asarray(change(layout, x))  # noqa: E731
+        physics = [jax.tree.map(on, ant.physics, p) for p in (starts, positive_w(after))]
+        outcome = on(ant.observation, observed_in_c(after, contact))
+        felt = on(wrenches(ant), contact.reshape(LANES, -1)).reshape(contact.shape)
+        got, got_contact = step_in_c(ant, physics[0], on(ant.action, actions))
+    assert_close(positive_w(got), physics[1], atol=1e-8, rtol=1e-8)
+    assert_close(got_contact, felt, atol=1e-6, rtol=1e-8)  # unclipped, N: up to hundreds
+    assert_close(observed_in_c(got, got_contact), outcome, atol=1e-8)
+
+
+def test_yaw_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
+    yaw = np.linspace(-np.pi, np.pi, LANES)
+    assert_commutes(ant, starts, episode, lambda layout, x: layout.turn(x, yaw))
+
+
+def test_mirror_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
+    assert_commutes(ant, starts, episode, lambda layout, x: layout.mirror(x))
+
+
+def test_mirror_is_read_off_the_model(ant: Ant) -> None:
+    """Legs 1↔2 and 3↔4 in the file's order, hips and ankles with their sign turned."""
+    assert ant.mirror.hinges == [2, 3, 0, 1, 6, 7, 4, 5]
+    assert ant.mirror.signs == [-1.0] * 8
+    assert ant.mirror.actuators == [6, 7, 4, 5, 2, 3, 0, 1]
+    assert ant.mirror.bodies == [0, 1, *range(5, 8), *range(2, 5), *range(11, 14), *range(8, 11)]
+
+
+def test_a_lopsided_model_is_refused() -> None:
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(pos=[0, 1, 1])
+    body.add_freejoint()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    with pytest.raises(ValueError, match="its own mirror image"):
+        mirror_of(spec.compile())
+
+
+# ── (c) resets, placing, divergence, actions ────────────────────────────────────────────────
+
+
+def keys(seed: int) -> jax.Array:
+    return jax.random.split(jax.random.key(seed), LANES)
+
+
+def distances(qpos: jax.Array) -> np.ndarray:
+    """Distance between every two lanes, `[n]`, without a lane's own."""
+    x = np.asarray(qpos)
+    apart = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    return apart[~np.eye(len(x), dtype=bool)]
+
+
+def test_every_reset_is_fresh_and_healthy(robot: Ant) -> None:
+    state, again, other = (robot.reset(keys(s), jnp.zeros(LANES)) for s in (0, 0, 1))
+    assert distances(state.physics.qpos).min() > 0.01
+    assert distances(state.physics.qvel).min() > 0.01
+    assert_close(state, again, atol=0)
+    assert (np.abs(state.physics.qpos - other.physics.qpos).max(-1) > 0.01).all()
+    height = state.position[:, 2]
+    assert (height > 0.2).all() and (height < 1.0).all()
+    assert not state.fallen.any() and not state.diverged.any()
+    assert_close(np.linalg.norm(state.physics.qpos[:, 3:7], axis=-1), 1.0, atol=1e-6)
+    assert np.abs(state.physics.qpos[:, :3] - robot.rest_pose()[:3]).max() <= 0.1 + 1e-6
+
+
+def test_a_reset_costs_no_physics(ant: Ant) -> None:
+    """No loop is in it, so no step and no solver."""
+    program = str(jax.make_jaxpr(ant.reset)(keys(0), jnp.zeros(LANES)))
+    assert "while[" not in program and "scan[" not in program
+
+
+def test_resets_are_turned(robot: Ant) -> None:
+    yaw = jnp.linspace(-3.0, 3.0, LANES)
+    straight, turned = robot.reset(keys(0), jnp.zeros(LANES)), robot.reset(keys(0), yaw)
+    assert_close(turned.observation, robot.observation.turn(straight.observation, yaw), atol=1e-6)
+    assert_close(turned.position, symmetry.turn_vector(straight.position, yaw), atol=1e-6)
+    assert_close(symmetry.wrap(turned.heading - straight.heading - yaw), 0.0, atol=1e-5)
+
+
+def test_placing_turns_the_record(robot: Ant, starts: Physics) -> None:
+    yaw, record = jnp.linspace(-3.0, 3.0, LANES), placed(robot, starts)
+    state = robot.place(record.physics, yaw)
+    assert_close(state.physics, robot.turn_physics(record.physics, yaw), atol=0)
+    assert_close(state.observation, robot.observation.turn(record.observation, yaw), atol=1e-6)
+    assert_close(state.position, symmetry.turn_vector(record.position, yaw), atol=1e-6)
+    assert not state.fallen.any() and not state.diverged.any()
+
+
+def actions_of(seed: int) -> jax.Array:
+    return jax.random.uniform(jax.random.key(seed), (LANES, 8), minval=-1.0)
+
+
+def broken(state: State) -> State:
+    """Lanes 3 and 5 with velocities that leave float32 within the step."""
+    physics = state.physics
+    qvel = physics.qvel.at[3].set(1e30).at[5, 7].set(-3e38)
+    return state.replace(physics=physics.replace(qvel=qvel))
+
+
+def assert_finite(tree: Any) -> None:
+    for x in jax.tree.leaves(tree):
+        if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            assert np.isfinite(x).all()
+
+
+def test_diverged_physics_ends_its_lane_alone(robot: Ant, starts: Physics) -> None:
+    state = placed(robot, starts)
+    action = actions_of(0).at[7, 2].set(jnp.nan)  # a third way to go wrong
+    after, sound = robot.step(broken(state), action), robot.step(state, actions_of(0))
+    assert np.flatnonzero(after.diverged).tolist() == [3, 5, 7]
+    assert_finite(after)
+    assert_close(after.observation[7], state.observation[7], atol=0)
+    others = np.delete(np.arange(LANES), [3, 5, 7])
+    assert_close(*(jax.tree.map(lambda x: x[others], s) for s in (after, sound)), atol=0)
+
+
+def test_actions_are_clipped(robot: Ant, starts: Physics) -> None:
+    state, action = placed(robot, starts), jnp.sign(actions_of(0))
+    assert_close(robot.step(state, 7.5 * action), robot.step(state, action), atol=0)
+
+
+# ── (d) layouts ─────────────────────────────────────────────────────────────────────────────
+
+
+def test_layouts_have_the_papers_sizes(ant: Ant) -> None:
+    assert ant.observation.size == 111
+    assert jax.tree.map(lambda layout: layout.size, ant.physics) == Physics(15, 14, 14)
+    assert ant.action.size == 8
+    assert ant.control_step == pytest.approx(ant.frames * ant.mj_model.opt.timestep)
+
+
+def test_layouts_describe_themselves(ant: Ant) -> None:
+    assert ant.observation.describe().splitlines()[2:] == [
+        "| 0–0 | height | m | invariant |",
+        "| 1–4 | orientation | 1 | quaternion |",
+        "| 5–12 | joint angles | rad | joints |",
+        "| 13–15 | velocity | m/s | vector |",
+        "| 16–18 | spin | rad/s | pseudovector in the body frame |",
+        "| 19–26 | joint velocities | rad/s | joints |",
+        "| 27–110 | contact | N·m, N | wrenches |",
+    ]
+
+
+def test_numbers_stand_where_gymnasium_has_them(
+    ant: Ant, starts: Physics, episode: tuple[Any, ...]
+) -> None:
+    """Ant-v5's 105 are our 111 without the six of the world body."""
+    gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    pytest.importorskip("gymnasium.envs.mujoco", reason="gymnasium is without MuJoCo")
+    env = gymnasium.make("Ant-v5").unwrapped
+    _, after, contact = episode
+    after = positive_w(after)
+    for qpos, qvel, felt, s in zip(
+        after.qpos, after.qvel, contact, observed_in_c(after, contact), strict=True
+    ):
+        env.set_state(qpos, qvel)
+        env.data.cfrc_ext[:] = felt
+        theirs = env._get_obs()
+        assert_close(s[:27], theirs[:27], atol=1e-12)
+        # Theirs is clipped along the world's axes, ours by length: alike where neither is.
+        free = np.repeat(np.hypot(*felt.reshape(-1, 3)[:, :2].T) <= 1, 3)[6:]
+        assert_close(s[33:][free], theirs[27:][free], atol=1e-12)
+        assert (np.sign(s[33:]) == np.sign(theirs[27:])).all()
+
+
+# ── (e) fresh starts inside a task ──────────────────────────────────────────────────────────
+
+
+def walk(robot: Ant, task: WalkForward, lanes: Lanes, steps: int) -> tuple[Lanes, list[Step]]:
+    made = []
+    for t in range(steps):
+        lanes, step = task.advance(robot, lanes, actions_of(t))
+        made.append(step)
+    return lanes, made
+
+
+def test_lanes_that_end_start_afresh(robot: Ant) -> None:
+    task = WalkForward(episode_steps=2, start_yaw=1.0)
+    lanes, steps = walk(robot, task, task.start(robot, keys(0)), 5)
+    down = np.stack([s.terminal for s in steps])
+    assert not down.any()  # two steps are too few to fall
+    for t, step in enumerate(steps):
+        assert (step.first == (t % 2 == 0)).all()
+        assert (step.last == (t % 2 == 1)).all()
+    assert (lanes.age == 1).all()
+    starts = jnp.concatenate([steps[t].before.physics.qpos for t in (0, 2, 4)])
+    assert distances(starts).min() > 0.01  # other lanes' and other episodes'
+    assert np.std(np.concatenate([steps[t].before.heading for t in (0, 2, 4)])) > 0.3
+    # Inside an episode a step begins where the last one ended.
+    assert_close(steps[3].before, steps[2].after, atol=0)
+
+
+def test_falls_and_divergence_end_an_episode(robot: Ant) -> None:
+    task = WalkForward(episode_steps=1000)
+    lanes = task.start(robot, keys(0)).replace(age=jnp.full(LANES, 7, jnp.int32))
+    robots = broken(lanes.robots)
+    high = robots.physics.qpos.at[9, 2].set(5.0)
+    robots = robots.replace(physics=robots.physics.replace(qpos=high))
+    after, step = task.advance(robot, lanes.replace(robots=robots), actions_of(0))
+    ended = [3, 5, 9]
+    assert np.flatnonzero(step.terminal).tolist() == ended
+    assert np.flatnonzero(step.last).tolist() == ended
+    assert not step.first.any()
+    assert np.array_equal(after.age, np.where(step.last, 0, 8))
+    assert_finite((after, step.reward, step.after))
+    assert np.abs(step.reward).max() < 1e3
+    fresh = after.robots.physics.qpos[jnp.array(ended)]
+    assert distances(fresh).min() > 0.01
+    assert (jnp.abs(fresh[:, 2] - 0.55) <= 0.1 + 1e-6).all()
+    assert not after.robots.fallen.any() and not after.robots.diverged.any()
+    alive = np.delete(np.arange(LANES), ended)
+    assert_close(*(x.observation[alive] for x in (after.robots, step.after)), atol=0)
+
+
+def test_reward_is_the_papers(robot: Ant) -> None:
+    """Forward velocity + 1 alive − 0.5 |a|² − 5e-4 |clipped wrenches|²."""
+    task = WalkForward()
+    _, (*_, step) = walk(robot, task, task.start(robot, keys(0)), 6)
+    before, after, a = (
+        np.asarray(x) for x in (step.before.position, step.after.position, step.action)
+    )
+    contact = np.asarray(step.after.observation)[:, 27:]
+    assert np.abs(contact).max() > 0
+    forward = (after[:, 0] - before[:, 0]) / 0.05
+    expected = forward + ~np.asarray(step.terminal) - 0.5 * (a**2).sum(-1)
+    assert_close(step.reward, expected - 5e-4 * (contact**2).sum(-1), atol=1e-4)
