@@ -13,7 +13,7 @@ import numpy as np
 from genidm import store, symmetry
 from genidm.errors import BadInput
 from genidm.models import Architecture
-from genidm.robots.base import Robot
+from genidm.robots import Robot, by_name
 
 Frame = Literal["world", "heading"]
 
@@ -90,13 +90,20 @@ class Controller(flax.struct.PyTreeNode):
         store.save_arrays(path, leaves, meta, overwrite)
 
 
-def load(path: Path, robot: Robot) -> Controller:
+def load(path: Path, robot: Robot | None = None) -> Controller:
     """A saved controller.
+
+    Args:
+      path: what `Controller.save` wrote.
+      robot: whose controller it is; found by its name, unless given.
 
     Raises:
       BadInput: the directory is torn, or the controller is another robot's.
     """
     tree, meta = store.load_arrays(path)
+    if tree.keys() != {"params", "mean", "std"}:
+        raise BadInput(f"{path} holds no controller")
+    robot = robot or by_name(meta["robot"])
     if meta["robot"] != robot.name:
         raise BadInput(f"{path} holds a controller for {meta['robot']}, not for {robot.name}")
     architecture = Architecture(

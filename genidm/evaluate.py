@@ -117,6 +117,28 @@ def evaluate(
     return episodes(outcome, bank.shape)
 
 
+def trace(
+    robot: Robot, controller: Steering, bank: Scenarios, settings: Test | None = None
+) -> tuple[Episodes, list[np.ndarray]]:
+    """`evaluate`, and the way of every episode: positions `[steps + 1, 3]`, in the bank's order."""
+    outcome, ways = run(
+        robot, controller, flatten(bank), settings, traced=bank.yaw.size, quiet=True
+    )
+    return episodes(outcome, bank.shape), ways
+
+
+def walking_speed(robot: Robot, policy: Steering, episodes: int = 100, seed: int = 0) -> np.ndarray:
+    """Speed towards +x of a policy that learned to walk there, `[episodes]`, m/s.
+
+    Each episode starts as in training and ends with a fall, or after 1000 steps.
+    """
+    keys = jax.random.split(jax.random.key(seed), (1, episodes))
+    # A target that is out of reach: what is gained on it is the way walked.
+    target = jnp.broadcast_to(jnp.asarray([1e4, 0.0, 0.0]), (1, episodes, 3))
+    outcome = evaluate(robot, policy, Scenarios(keys, jnp.zeros((1, episodes)), target))
+    return (outcome.start - outcome.closest)[0] / (outcome.steps[0] * robot.control_step)
+
+
 def run(
     robot: Robot,
     controller: Steering,
@@ -192,6 +214,8 @@ def _queues(
     share = -(-total // count)
     lanes = count * min(-(-settings.lanes // count), share)
     dealt = np.minimum(np.arange(share * count), total - 1).reshape(share, count).T.reshape(-1)
+    # One a device at least: jax forgets how an array without elements is shared out.
+    rows = count * max(1, -(-traced // count))
     shapes = jax.eval_shape(
         robot.reset, jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes)
     )
@@ -202,7 +226,7 @@ def _queues(
         now=_nothing(lanes),
         ended=_nothing(share * count),
         taken=jnp.zeros(count, jnp.int32),
-        ways=jnp.zeros((-(-traced // count) * count, settings.max_steps + 1, 3)),
+        ways=jnp.zeros((rows, settings.max_steps + 1, 3)),
     )
     shares = jax.tree.map(lambda x: x[dealt], bank)
     return devices.put(queue, mesh), devices.put(shares, mesh)
@@ -216,8 +240,12 @@ def _in_order(x: jax.Array, mesh: Mesh) -> np.ndarray:
 
 
 def _nothing(count: int) -> Outcome:
-    number, no = jnp.zeros(count), jnp.zeros(count, bool)
-    return Outcome(number, number, no, no, no, jnp.zeros(count, jnp.int32), number)
+    def zeros(kind: type = float) -> jax.Array:
+        return jnp.zeros(count, kind)  # an array of its own, as it is donated
+
+    return Outcome(
+        zeros(), zeros(), zeros(bool), zeros(bool), zeros(bool), zeros(jnp.int32), zeros()
+    )
 
 
 def _count(queue: _Queue, total: int, mesh: Mesh) -> int:

@@ -55,6 +55,19 @@ class Learner(flax.struct.PyTreeNode):
     mind: Mind
 
 
+class Policy(flax.struct.PyTreeNode):
+    """What PPO has learned, without exploration; steers like a controller, goals unheeded."""
+
+    statistics: RunningStatisticsState
+    params: Any
+    networks: ppo_networks.PPONetworks = flax.struct.field(pytree_node=False)
+
+    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+        """Actions `[..., A]` for states `[..., S]`."""
+        logits = self.networks.policy_network.apply(self.statistics, self.params, s)
+        return self.networks.parametric_action_distribution.mode(logits)
+
+
 @dataclasses.dataclass(frozen=True)
 class PPO:
     """Settings of PPO.
@@ -76,11 +89,11 @@ class PPO:
     """
 
     lanes: int = 128
-    unroll: int = 32
-    epochs: int = 5
+    unroll: int = 16
+    epochs: int = 7
     minibatches: int = 8
     learning_rate: float = 5e-4
-    discount: float = 0.98
+    discount: float = 0.97
     gae: float = 0.95
     clip: float = 0.2
     entropy: float = 1e-2
@@ -108,6 +121,11 @@ class PPO:
             value_hidden_layer_sizes=self.value_hidden,
             activation=linen.tanh,
         )
+
+    def policy(self, robot: Robot, learner: Learner) -> Policy:
+        """The policy of a learner, without exploration."""
+        mind = learner.mind
+        return Policy(mind.statistics, mind.params.policy, self.networks(robot))
 
     def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
         networks = self.networks(robot)

@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.errors import BadInput
 from genidm.experience import Experience, record
 from genidm.progress import compiled
 from genidm.robots.base import Robot
@@ -34,6 +35,10 @@ class RandomActions:
 
     lanes: int = 128
     unroll: int = 32
+
+    def __post_init__(self) -> None:
+        if self.lanes < 1 or self.unroll < 1:
+            raise BadInput("random sampling needs lanes and unroll of at least 1")
 
     def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
         draw = jax.vmap(lambda key: jax.random.uniform(key, (robot.action.size,), minval=-1.0))

@@ -1,0 +1,488 @@
+"""A cell end to end: its stages, its report, what it refuses, and what a kill costs it.
+
+Run as a script, `python tests/test_experiment.py OUT POINT...`, this module runs a cell
+again and again, killed by SIGKILL at each point in turn, and lets the last run end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from point import Point
+
+from genidm import collect as collecting
+from genidm import controller, experiment, methods, stats, store
+from genidm.agents.ppo import PPO
+from genidm.agents.random import RandomActions
+from genidm.episodes import Episodes
+from genidm.errors import BadInput
+from genidm.evaluate import Test
+from genidm.experiment import Options, cell, run_cell, scale_of
+from genidm.generalize import Generalize
+from genidm.methods import Method, literal
+from genidm.progress import Progress
+from genidm.scenarios import scenarios
+from genidm.store import Stage
+from genidm.tasks import WalkForward
+
+
+def tiny(method: Method, **changes) -> Method:
+    agent = PPO(lanes=16, unroll=8, epochs=1, minibatches=2, hidden=(8,), value_hidden=(8,))
+    fit = dataclasses.replace(method.fit, updates=2500, batch=16, idm=(8,), lfm=(8,))
+    if method.fit.latent_size:
+        fit = dataclasses.replace(fit, latent_size=2)
+    fields = dict(
+        agent=agent if isinstance(method.agent, PPO) else RandomActions(lanes=16, unroll=8),
+        task=WalkForward(episode_steps=20),
+        generalize=method.generalize and Generalize(segment=6, lanes=32),
+        look_ahead=10,
+        fit=fit,
+    )
+    return dataclasses.replace(method, **(fields | changes))
+
+
+RS, GE, LR = (tiny(m) for m in (methods.RS, methods.GE, methods.LR))
+TEST = Test(max_steps=40, lanes=16, chunk=10)
+
+
+def options(out: Path, **changes) -> Options:
+    return dataclasses.replace(Options(scale="0.5", out=out, episodes=2, test=TEST), **changes)
+
+
+STAGES = ("collect", "replay", "fit", "run")
+
+
+@contextlib.contextmanager
+def counted() -> Iterator[Counter]:
+    """Which stages' work is done meanwhile, and how often."""
+    calls: Counter = Counter()
+
+    def counting(name: str, work: Callable) -> Callable:
+        def counted(*args, **kwargs):
+            calls[name] += 1
+            return work(*args, **kwargs)
+
+        return counted
+
+    with pytest.MonkeyPatch.context() as m:
+        for name in STAGES:
+            m.setattr(experiment, name, counting(name, getattr(experiment, name)))
+        yield calls
+
+
+@dataclasses.dataclass
+class Finished:
+    """The runs of three methods, one after another, and what each of them had to do."""
+
+    out: Path
+    report: Path
+    done: list[Counter]
+
+    @property
+    def results(self) -> dict:
+        return json.loads((self.report / "results.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Finished:
+    out, done = tmp_path_factory.mktemp("runs"), []
+    for method in (GE, LR, RS):
+        with counted() as calls:
+            report = run_cell(Point(), method, options(out))
+        done.append(calls)
+    return Finished(out, report, done)
+
+
+@pytest.fixture
+def copy(finished: Finished, tmp_path: Path) -> Path:
+    return shutil.copytree(finished.out, tmp_path / "runs")
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    paths = (p for p in sorted(directory.rglob("*")) if p.is_file())
+    return {str(p.relative_to(directory)): p.read_bytes() for p in paths}
+
+
+# ── a cell ──────────────────────────────────────────────────────────────────────────────
+
+
+def test_methods_share_the_stages_that_they_agree_on(finished: Finished) -> None:
+    assert finished.done == [
+        Counter(collect=1, replay=1, fit=1, run=1),
+        Counter(fit=1, run=1),  # LR learns from what GE collected and replayed
+        Counter(collect=1, fit=1, run=1),
+    ]
+    stages = Counter(p.parent.name.rsplit("-", 1)[0] for p in finished.out.rglob("done.json"))
+    both = ["experience-PPO-0", "experience-RandomActions-0", "replay-segments-0"]
+    each = [f"{prefix}{m}-0" for prefix in ("", "test-") for m in ("RS", "GE", "LR")]
+    assert stages == Counter(both + each)
+
+
+def test_the_report_is_there(finished: Finished) -> None:
+    names = {p.name for p in finished.report.iterdir()}
+    assert {"results.json", "table.txt", "table.md", "violins.png", "paths.png"} <= names
+    assert {"collecting.png", "fitting.png", "residual.png", "bearings.png"} <= names
+    for png in finished.report.glob("*.png"):
+        assert png.read_bytes()[:4] == b"\x89PNG" and png.stat().st_size > 5000
+    lines = (finished.report / "table.txt").read_text().splitlines()
+    rows = [line.split()[0] for line in lines if line[:2] in ("RS", "GE", "LR") and "±" in line]
+    assert rows == ["RS", "GE", "LR"] and "paths.png" in lines[-1]
+
+
+def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:
+    results = finished.results
+    bank = scenarios(Point(), 10, 2)
+    assert (results["robot"], results["scale"]) == ("point", "0.5")
+    assert results["scenarios"] == bank.digest() and results["versions"]["jax"]
+    assert list(results["methods"]) == ["RS", "GE", "LR"] and results["hardware"]
+    lr = results["methods"]["LR"]
+    keys = {"interactions", "replayed", "seeds", "episodes", "mean", "std", "ci95", "iqm"}
+    assert keys | {"success", "fell", "settings"} <= lr.keys()
+    assert (lr["interactions"], lr["replayed"]) == (1024, 512)
+    assert (results["methods"]["RS"]["replayed"], lr["seeds"], lr["episodes"]) == (0, 10, 2)
+    assert list(lr["success"]) == ["0.25", "0.5", "1.0"]
+    assert lr["settings"]["fit"]["latent_size"] == 2 and lr["settings"]["look_ahead"] == 10
+    assert results["paired"].keys() == {"GE-RS", "LR-GE"}
+
+
+def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> None:
+    stage = next(finished.out.glob("point/test-LR-0-*"))
+    tree, _ = store.load_arrays(stage / "episodes")
+    summary = stats.summary(Episodes(**tree["episodes"]))
+    row = finished.results["methods"]["LR"]
+    for name in ("mean", "std", "iqm", "fell", "ci95"):
+        assert row[name] == pytest.approx(summary[name], abs=1e-6)
+    assert len(tree["ways"]) == 20 and 0 < row["mean"] < 5
+
+
+def test_a_second_run_does_nothing_again(copy: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)}
+    was = files(copy)
+    with counted() as calls:
+        run_cell(Point(), LR, options(copy))
+    assert not calls
+    assert {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)} == before
+    assert files(copy).keys() == was.keys()
+    assert [n for n, x in files(copy).items() if x != was[n] and not n.endswith(".png")] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "again"),
+    [
+        (dict(fit=dataclasses.replace(LR.fit, latent_size=3)), {"fit", "run"}),
+        (dict(look_ahead=3), {"fit", "run"}),
+        (dict(generalize=Generalize(segment=3)), {"replay", "fit", "run"}),
+        (dict(task=WalkForward(19)), {"collect", "replay", "fit", "run"}),
+    ],
+)
+def test_one_change_runs_what_depends_on_it_again(
+    copy: Path, monkeypatch, changes: dict, again: set
+) -> None:
+    """Which of the stages are to be made is all that is looked at: none is made."""
+    this = cell(Point(), dataclasses.replace(LR, **changes), options(copy))
+    made = {
+        "collect": this.experience_stage.done,
+        "replay": this.replay_stage.done,
+        "fit": this.fit_stage.done,
+    }
+    assert {name for name, done in made.items() if not done} == again - {"run"}
+
+
+def test_another_seed_and_another_test_have_stages_of_their_own(copy: Path) -> None:
+    seed = cell(Point(), LR, options(copy, seed=1))
+    assert not (seed.experience_stage.done or seed.replay_stage.done or seed.fit_stage.done)
+    with counted() as calls:
+        run_cell(Point(), LR, options(copy, episodes=1))
+        run_cell(Point(), LR, options(copy, test=dataclasses.replace(TEST, reach=0.2)))
+    assert calls == Counter(run=2)
+
+
+def test_results_are_also_written_where_they_are_asked_for(copy: Path, tmp_path: Path) -> None:
+    report = run_cell(Point(), LR, options(copy, results=tmp_path / "results"))
+    written = files(tmp_path / "results")
+    assert written["point.json"] == (report / "results.json").read_bytes()
+    assert {"point_table.txt", "point_violins.png", "point_paths.png"} <= written.keys()
+
+
+def test_the_literal_method_is_the_papers() -> None:
+    this = cell(Point(), LR, Options(literal=True)).method
+    assert this == literal(LR) and this.name == "LR literal" and this.look_ahead == 1
+    assert (this.generalize.mode, this.fit.latent_weight, this.fit.decay) == (
+        "episodes",
+        0.25,
+        False,
+    )
+
+
+def test_scales_are_shares_of_the_paper() -> None:
+    assert dataclasses.astuple(scale_of("paper", 2000)) == ("paper", 2000, 1.0, 10, 1000)
+    assert dataclasses.astuple(scale_of("0.1", 2000)) == ("0.1", 200, 0.1, 10, 100)
+    assert dataclasses.astuple(scale_of("2", 2000)) == ("2", 4000, 1.0, 10, 1000)
+    assert scale_of("quick", 2000).interactions == 250_000
+    for wrong in ("huge", "0", "-1", "nan", "inf", ""):
+        with pytest.raises(BadInput, match="--scale"):
+            scale_of(wrong, 2000)
+
+
+# ── bad input: one sentence on stderr, exit status 2, nothing overwritten ───────────────
+
+
+def command(out: Path, *flags: str, robot: type[Point] = Point, method: Method = LR) -> None:
+    """The command line of a cell, at the scale of these tests."""
+    test = ("--test.max-steps", "40", "--test.lanes", "16", "--test.chunk", "10")
+    start = ("cell", "--scale", "0.5", "--episodes", "2", "--out", str(out), *test)
+    with pytest.MonkeyPatch.context() as m:
+        m.setattr(sys, "argv", [*start, *flags])
+        experiment.main(robot, method)
+
+
+def refused(out: Path, capsys, why: str, *flags: str, **options) -> None:
+    before = files(out) if out.is_dir() else {}
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        command(out, *flags, **options)
+    said = [line for line in capsys.readouterr().err.splitlines() if line[:6] == "error:"]
+    assert exit_.value.code == 2 and len(said) == 1 and why in said[0]
+    after = files(out) if out.is_dir() else {}
+    assert {name: after.get(name) for name in before} == before
+
+
+def test_the_command_ends_with_the_table(copy: Path, capsys) -> None:
+    with counted() as calls:
+        command(copy)
+    assert not calls
+    table = next(copy.glob("point/report-0.5/table.txt")).read_text()
+    assert capsys.readouterr().out == table + "\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--scale", "huge"), "'huge'"),
+        (("--scale", "-0.5"), "--scale"),
+        (("--method.fit.latent-weight", "1.5"), "λ"),
+        (("--method.fit.latent-weight", "0"), "λ"),
+        (("--method.fit.latent-size", "0"), "k (latent_size)"),
+        (("--method.look-ahead", "0"), "look_ahead"),
+        (("--method.share", "2"), "share"),
+        (("--episodes", "0"), "at least one"),
+        (("--test.lanes", "0"), "lanes"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(
+    tmp_path: Path, capsys, flags: tuple, why: str
+) -> None:
+    refused(tmp_path / "runs", capsys, why, *flags)
+    assert not list(tmp_path.rglob("experience-*"))
+
+
+def test_an_out_that_cannot_be_written_is_refused(tmp_path: Path, capsys) -> None:
+    (tmp_path / "file").write_text("precious")
+    refused(tmp_path / "file", capsys, "cannot use")
+    refused(tmp_path / "file" / "deeper", capsys, "cannot use")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def stage_of(out: Path, name: str) -> Path:
+    return next((out / "point").glob(f"{name}-*"))
+
+
+def forget(out: Path, *names: str) -> None:
+    """As if these stages had not been finished."""
+    for name in names:
+        (stage_of(out, name) / "done.json").unlink()
+
+
+def test_nan_in_the_experience_is_refused(copy: Path, capsys) -> None:
+    forget(copy, "test-LR", "LR", "replay")
+    chunk = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000"
+    tree, meta = store.load_arrays(chunk)
+    tree["o"][3, 2, 1] = np.nan
+    store.save_arrays(chunk, tree, meta, overwrite=True)
+    refused(copy, capsys, "o holds NaN")
+
+
+def test_a_torn_experience_is_refused(copy: Path, capsys) -> None:
+    forget(copy, "test-LR", "LR", "replay")
+    file = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000" / "s.npy"
+    file.write_bytes(file.read_bytes()[:-1])
+    refused(copy, capsys, "cut short")
+
+
+def test_a_torn_controller_is_refused(copy: Path, capsys) -> None:
+    forget(copy, "test-LR")
+    (stage_of(copy, "LR") / "controller" / "mean.npy").unlink()
+    refused(copy, capsys, "mean.npy is missing")
+
+
+def test_the_controller_of_another_robot_is_refused(copy: Path, capsys) -> None:
+    class Other(Point):
+        name = "other"
+
+    forget(copy, "test-LR")
+    path = stage_of(copy, "LR") / "controller"
+    controller.load(path, Point()).replace(robot=Other()).save(path, overwrite=True)
+    refused(copy, capsys, "controller for other, not for point")
+
+
+def test_the_experience_of_another_robot_is_refused(copy: Path, capsys) -> None:
+    """Of its state, or, where that has as many numbers, of its physics."""
+    forget(copy, "test-LR", "LR", "replay")
+    chunk = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000"
+    tree, meta = store.load_arrays(chunk)
+    wheels = {**tree, "physics": {"wheels": tree["s"]}}
+    store.save_arrays(chunk, wheels, meta, overwrite=True)
+    refused(copy, capsys, "physics of another robot than point")
+    store.save_arrays(chunk, {**tree, "s": tree["s"][..., 1:]}, meta, overwrite=True)
+    refused(copy, capsys, "s has shape")
+    store.save_arrays(chunk, {"x": tree["s"]}, meta, overwrite=True)
+    refused(copy, capsys, "holds no experience")
+
+
+def test_a_checkpoint_of_another_setting_is_refused(copy: Path, capsys) -> None:
+    """It cannot come about by a command, whose settings name the directory."""
+    forget(copy, "test-LR", "LR")
+    stage = Stage(stage_of(copy, "LR"))
+    stage.checkpoints().save(1000, {"update": np.zeros(3)})
+    refused(copy, capsys, "another robot or setting")
+
+
+def test_the_command_itself_exits_with_2() -> None:
+    line = [sys.executable, "-m", "experiments.ant_lr", "--scale", "huge"]
+    run = subprocess.run(line, capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 2 and run.stdout == "" and run.stderr.count("\n") == 1
+    assert run.stderr.startswith("error: --scale takes")
+
+
+# ── kill -9 ─────────────────────────────────────────────────────────────────────────────
+
+ROOT = Path(__file__).parents[1]
+
+# Where a run is killed: in the nth call of a stage's bar, or as a stage is to be marked done.
+POINTS = (
+    *("collect:5", "finish:experience", "generalize:1", "finish:replay", "fit:2", "finish:LR"),
+    *("evaluate:3", "finish:test", "report:1"),
+)
+
+
+def test_a_run_killed_in_every_stage_ends_with_the_same_bits(tmp_path: Path) -> None:
+    script = [sys.executable, __file__]
+    env = {
+        **os.environ,
+        "GENIDM_CHECKPOINT_SECONDS": "0",
+        "GENIDM_DEVICES": "2",
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    for name, points in (("whole", ()), ("killed", POINTS)):
+        run = subprocess.run(
+            [*script, str(tmp_path / name), *points], env=env, capture_output=True, text=True
+        )
+        assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == [f"{point}:killed" for point in POINTS]
+    compare(tmp_path / "whole", tmp_path / "killed", "point/report-0.5/results.json")
+
+
+def compare(whole: Path, killed: Path, results: str) -> None:
+    """Every array that is kept, and the results, to the bit."""
+    a, b = ({n: x for n, x in files(d).items() if n.endswith(".npy")} for d in (whole, killed))
+    arrays = {n for n in a if "checkpoints" not in n}
+    assert {n.split("/")[1].split("-")[0] for n in arrays} == {"experience", "replay", "LR", "test"}
+    assert {n for n in b if "checkpoints" not in n} == arrays
+    assert [n for n in arrays if a[n] != b[n]] == []
+    both = [json.loads((d / results).read_text())["methods"] for d in (whole, killed)]
+    assert both[0] == both[1] and both[0]["LR"]["mean"] > 0
+
+
+def run_killed(out: Path, points: list[str]) -> None:
+    """Runs the cell in a fork for each point, killed there; then to the end."""
+    for point in [*points, None]:
+        child = os.fork()
+        if child == 0:
+            collecting.CHUNK = 2 * 16 * 8
+            if point:
+                arm(*point.split(":"))
+            run_cell(Point(), LR, options(out))
+            os._exit(0)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if point:
+            print(point, "killed" if status == -signal.SIGKILL else status, sep=":")
+        elif status:
+            sys.exit(status)
+
+
+def arm(where: str, when: str) -> None:
+    """Has this process killed at a point of its run."""
+    from genidm.report import figures
+
+    calls = itertools.count(1)
+
+    def at(matches: Callable[..., bool], work: Callable) -> Callable:
+        @functools.wraps(work)
+        def dying(self, *args, **kwargs):
+            if matches(self):
+                os.kill(os.getpid(), signal.SIGKILL)
+            return work(self, *args, **kwargs)
+
+        return dying
+
+    def nth(bar: Progress) -> bool:
+        return bar._bar.desc.startswith(where) and next(calls) == int(when)
+
+    if where == "finish":
+        Stage.finish = at(lambda s: s.directory.name.startswith(f"{when}-"), Stage.finish)
+    elif where == "report":
+        figures.violins = at(lambda rows: True, figures.violins)
+    else:
+        Progress.advance = at(nth, Progress.advance)
+
+
+ANT = (
+    "-m",
+    "experiments.ant_lr",
+    "--scale",
+    "0.002",
+    "--episodes",
+    "10",
+    "--test.max-steps",
+    "200",
+)
+
+
+@pytest.mark.slow
+def test_an_ant_killed_from_outside_in_every_stage_ends_with_the_same_bits(tmp_path: Path) -> None:
+    env = {**os.environ, "GENIDM_CHECKPOINT_SECONDS": "0", "GENIDM_DEVICES": "2"}
+    whole, killed = (
+        [sys.executable, *ANT, "--out", str(tmp_path / n)] for n in ("whole", "killed")
+    )
+    subprocess.run(whole, env=env, cwd=ROOT, check=True, capture_output=True)
+    root = tmp_path / "killed" / "ant"
+    for stage in ("experience", "replay", "LR", "test"):
+        with subprocess.Popen(killed, env=env, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+            while not list(root.glob(f"{stage}-*/config.json")) and process.poll() is None:
+                time.sleep(0.01)
+            time.sleep(2.0 if stage == "test" else 0.1)  # some way into it
+            process.kill()
+        assert process.returncode == -signal.SIGKILL
+        assert not list(root.glob(f"{stage}-*/done.json"))
+    subprocess.run(killed, env=env, cwd=ROOT, check=True, capture_output=True)
+    compare(tmp_path / "whole", tmp_path / "killed", "ant/report-0.002/results.json")
+
+
+if __name__ == "__main__":
+    run_killed(Path(sys.argv[1]), sys.argv[2:])

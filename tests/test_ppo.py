@@ -1,0 +1,416 @@
+"""Collecting: what PPO learns on a point, and what is kept of it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo.losses import compute_ppo_loss
+from brax.training.types import Transition
+from point import Point
+
+from genidm import collect as collecting
+from genidm import devices, store
+from genidm.agents import ppo
+from genidm.agents.base import Iterate, Learning
+from genidm.agents.ppo import PPO
+from genidm.agents.random import RandomActions
+from genidm.collect import collect
+from genidm.errors import BadInput
+from genidm.experience import Experience, load_chunks
+from genidm.progress import METRICS, Progress, read_metrics
+from genidm.store import Stage
+from genidm.tasks import Step, WalkForward, split
+
+# It falls, and it runs into the time limit, so that episodes end in both ways.
+ROBOT = Point(speed=2.0, falls_at=0.25)
+TASK = WalkForward(episode_steps=9)
+AGENT = PPO(lanes=16, unroll=8, epochs=2, minibatches=4, hidden=(16,), value_hidden=(16,))
+SIZE = AGENT.lanes * AGENT.unroll
+ITERATIONS = 5
+
+
+class Prepared:
+    """An agent whose programs are compiled once for each robot, task and mesh."""
+
+    def __init__(self, agent: PPO):
+        self.agent, self.lanes, self.unroll = agent, agent.lanes, agent.unroll
+
+    @functools.cache  # noqa: B019
+    def learning(self, robot: Point, task: WalkForward, mesh) -> Learning:
+        learning = self.agent.learning(robot, task, mesh)
+        ready: list[Iterate] = []
+
+        def prepare(learner: Any) -> Iterate:
+            ready.extend([] if ready else [learning.prepare(learner)])
+            return ready[0]
+
+        return learning._replace(prepare=prepare)
+
+
+PREPARED = Prepared(AGENT)
+
+
+def gather(agent=PREPARED, iterations: int = ITERATIONS, **options) -> tuple[Experience, Any]:
+    options = dict(task=TASK, quiet=True) | options
+    size = agent.lanes * agent.unroll
+    return collect(options.pop("robot", ROBOT), agent, iterations * size, **options)
+
+
+@functools.cache
+def undisturbed() -> tuple[Experience, Any]:
+    return gather()
+
+
+def leaves(tree: Any) -> list[np.ndarray]:
+    keys = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)
+    return [np.asarray(x) for x in jax.tree.leaves(keys)]
+
+
+def is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def same(a: Any, b: Any) -> bool:
+    pairs = zip(leaves(a), leaves(b), strict=True)
+    return all(x.dtype == y.dtype and x.tobytes() == y.tobytes() for x, y in pairs)
+
+
+def close(a: Any, b: Any, atol: float) -> None:
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=atol)
+
+
+# ── learning ────────────────────────────────────────────────────────────────────────────
+
+
+def test_ppo_learns_the_way_that_is_rewarded() -> None:
+    """Forward is +x, and a point at full speed makes 1 m/s."""
+    agent = PPO(lanes=64, unroll=16, learning_rate=3e-3, hidden=(32,), value_hidden=(32,))
+    record, _ = gather(agent, 30, robot=Point(), task=WalkForward(64))
+    speed = (record.o_next - record.o)[..., 0] / Point.control_step
+    assert speed[:16].mean() < 0.4 and 0.9 < speed[-80:].mean() <= speed.max() < 1.0001
+
+
+def test_recording_changes_no_parameter_by_a_bit(monkeypatch) -> None:
+    recording = undisturbed()[1]
+    monkeypatch.setattr(ppo, "record", lambda step: None)
+    blind = AGENT.learning(ROBOT, TASK, devices.mesh())
+    learner = blind.place(jax.jit(blind.start)(jax.random.key(0)))
+    iterate = blind.prepare(learner)
+    for _ in range(ITERATIONS):
+        learner, nothing, _ = iterate(learner)
+    assert nothing is None and same(learner, recording)
+
+
+def test_what_is_learned_does_not_depend_on_the_number_of_devices() -> None:
+    record, learner = gather(mesh=devices.mesh(jax.devices()[:1]))
+    close(record, undisturbed()[0], atol=1e-4)
+    close(learner, undisturbed()[1], atol=1e-3)
+
+
+def test_seeds_matter_and_nothing_else_does() -> None:
+    again, other = gather(seed=0), gather(seed=1)
+    assert same(again, undisturbed())
+    assert not np.isin(other[0].a, again[0].a).any()
+
+
+def test_what_learns_is_moved_by_every_iteration() -> None:
+    learning = PREPARED.learning(ROBOT, TASK, devices.mesh())
+    begun = jax.jit(learning.start)(jax.random.key(0)).mind.params
+    ended = undisturbed()[1].mind
+    moved = [np.abs(x - y).max() for x, y in zip(leaves(begun), leaves(ended.params), strict=True)]
+    assert min(moved) > 1e-4 and ended.statistics.count.lo == ITERATIONS * SIZE
+
+
+# ── the loss ────────────────────────────────────────────────────────────────────────────
+
+
+@functools.cache
+def walked() -> tuple[Any, Transition, Step, Any]:
+    """8 steps of 16 lanes: what PPO packs of them, and the steps themselves, one by one."""
+    networks = AGENT.networks(ROBOT)
+    distribution = networks.parametric_action_distribution
+    policy = jax.jit(networks.policy_network.init)(jax.random.key(0))
+    statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
+    task = WalkForward(episode_steps=5)
+    lanes = jax.jit(functools.partial(task.start, ROBOT))(jax.random.split(jax.random.key(1), 16))
+    walk = functools.partial(ppo._walk, ROBOT, task, networks, AGENT.unroll)
+    _, _, batch, _ = jax.jit(walk)(statistics, policy, lanes)
+
+    @jax.jit
+    def one(lanes):
+        lanes, keys = split(lanes)
+        logits = networks.policy_network.apply(statistics, policy, lanes.robots.observation)
+        raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
+        lanes, step = task.advance(ROBOT, lanes, distribution.postprocess(raw))
+        return lanes, (step, (logits, raw))
+
+    steps = []
+    for _ in range(AGENT.unroll):
+        lanes, step = one(lanes)
+        steps.append(step)
+    return policy, batch, *jax.tree.map(lambda *x: np.stack(x), *steps)
+
+
+def loss_of(batch: Transition) -> tuple[Any, dict[str, Any]]:
+    """Brax's loss `[B, T, ...]` of a policy a little off the one that walked."""
+    networks = AGENT.networks(ROBOT)
+    params = target_params()
+    statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
+    return jax.jit(functools.partial(compute_ppo_loss, ppo_network=networks, **LOSS))(
+        params, statistics, batch, jax.random.key(2)
+    )
+
+
+LOSS = dict(discounting=0.9, gae_lambda=0.8, reward_scaling=0.5, clipping_epsilon=0.05)
+
+
+def target_params() -> Any:
+    value = jax.jit(AGENT.networks(ROBOT).value_network.init)(jax.random.key(3))
+    return ppo.PPONetworkParams(jax.tree.map(lambda x: 1.3 * x, walked()[0]), value)
+
+
+def by_lane(tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), tree)
+
+
+def test_our_transitions_give_the_loss_of_braxs_own_layout() -> None:
+    """Brax's has the next state of every step, and log π from the very arrays."""
+    _, batch, steps, (logits, raw) = walked()
+    log_prob = jax.jit(AGENT.networks(ROBOT).parametric_action_distribution.log_prob)(logits, raw)
+    policy_extras = {"log_prob": log_prob, "raw_action": raw, "distribution_params": logits}
+    truncated = np.float32(steps.last & ~steps.terminal)
+    whole = Transition(
+        observation=steps.before.observation,
+        action=steps.action,
+        reward=steps.reward,
+        discount=1 - np.float32(steps.terminal),
+        next_observation=steps.after.observation,
+        extras={"policy_extras": policy_extras, "state_extras": {"truncation": truncated}},
+    )
+    ours, braxs = loss_of(by_lane(batch)), loss_of(by_lane(whole))
+    assert batch.next_observation.shape[0] == 1
+    close(ours, braxs, atol=1e-5)
+    assert abs(ours[0]) > 1e-2
+
+
+def test_truncation_and_termination_count_as_in_a_slow_gae() -> None:
+    _, batch, steps, _ = walked()
+    truncated = steps.last & ~steps.terminal
+    assert truncated[:-1].any() and steps.terminal[:-1].any()
+    networks, params = AGENT.networks(ROBOT), target_params()
+    statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
+    value = jax.jit(functools.partial(networks.value_network.apply, statistics, params.value))
+    values = np.float64(value(jnp.asarray(steps.before.observation)))
+    final = np.float64(value(jnp.asarray(steps.after.observation[-1])))
+    error, advantage = slow_gae(steps, truncated, values, final)
+    _, info = loss_of(by_lane(batch))
+    assert info["v_loss"] == pytest.approx(np.mean(error**2) / 4, abs=1e-5)
+    ratio = np.exp(new_log_prob(params) - np.float64(batch.extras["policy_extras"]["log_prob"]))
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    clipped = np.minimum(ratio * advantage, np.clip(ratio, 0.95, 1.05) * advantage)
+    assert info["policy_loss"] == pytest.approx(-clipped.mean(), abs=1e-5)
+    assert (np.abs(ratio - 1) > 0.05).any() and abs(clipped.mean()) > 1e-3
+
+
+def slow_gae(steps: Step, truncated, values, final) -> tuple[np.ndarray, np.ndarray]:
+    """λ-returns less values, and one-step advantages towards them, lane by lane.
+
+    A fall ends the return. At the time limit nobody knows what would have come, so that
+    step teaches nothing, and the return starts anew before it.
+    """
+    error, advantage = np.zeros(values.shape), np.zeros(values.shape)
+    for lane in range(values.shape[1]):
+        v_next, return_next, error_next = final[lane], final[lane], 0.0
+        for t in reversed(range(values.shape[0])):
+            v, r = values[t, lane], 0.5 * steps.reward[t, lane]
+            if truncated[t, lane]:
+                error[t, lane] = advantage[t, lane] = 0.0
+            elif steps.terminal[t, lane]:
+                error[t, lane] = advantage[t, lane] = r - v
+            else:
+                error[t, lane] = r + 0.9 * v_next - v + 0.9 * 0.8 * error_next
+                advantage[t, lane] = r + 0.9 * return_next - v
+            v_next, error_next = v, error[t, lane]
+            return_next = v + error_next
+    return error, advantage
+
+
+def new_log_prob(params: Any) -> np.ndarray:
+    _, _, steps, (_, raw) = walked()
+    networks = AGENT.networks(ROBOT)
+    statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
+    observation = jnp.asarray(steps.before.observation)
+    logits = networks.policy_network.apply(statistics, params.policy, observation)
+    log_prob = jax.jit(networks.parametric_action_distribution.log_prob)(logits, raw)
+    return np.float64(log_prob)
+
+
+# ── the record ──────────────────────────────────────────────────────────────────────────
+
+
+def test_the_record_is_continuous_but_for_fresh_starts() -> None:
+    r, _ = undisturbed()
+    assert r.first.shape == (ITERATIONS * AGENT.unroll, AGENT.lanes)
+    goes_on = ~r.last[:-1]
+    np.testing.assert_array_equal(r.o_next[:-1][goes_on], r.o[1:][goes_on])
+    np.testing.assert_array_equal(r.first[1:], r.last[:-1])
+    assert r.first[0].all() and (r.o_next[:-1] != r.o[1:]).any(axis=-1)[r.last[:-1]].all()
+    starts = r.o[r.first]
+    assert np.abs(starts[:, :2]).max() < 0.1 and len(np.unique(starts, axis=0)) == len(starts)
+
+
+def test_episodes_end_by_a_fall_or_at_the_time_limit() -> None:
+    r, _ = undisturbed()
+    age = np.zeros(r.first.shape, int)
+    for t, lane in np.ndindex(age.shape):
+        age[t, lane] = 1 if r.first[t, lane] else age[t - 1, lane] + 1
+    fell = np.hypot(r.o_next[..., 0], r.o_next[..., 1]) > ROBOT.falls_at
+    np.testing.assert_array_equal(r.last, fell | (age == TASK.episode_steps))
+    assert fell.any() and (r.last & ~fell).any()
+
+
+def test_the_recorded_action_leads_from_the_recorded_physics_to_the_next() -> None:
+    r, _ = undisturbed()
+    flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), r)
+    placed = jax.jit(ROBOT.place)(flat.physics, jnp.zeros(r.interactions))
+    after = jax.jit(ROBOT.step)(placed, flat.a)
+    np.testing.assert_allclose(after.position, flat.o_next, rtol=0, atol=1e-5)
+    onward = np.flatnonzero(~r.last[:-1].ravel())
+    s_next = np.asarray(r.s[1:]).reshape(-1, r.s.shape[-1])
+    np.testing.assert_allclose(after.observation[onward], s_next[onward], rtol=0, atol=1e-5)
+
+
+def test_diverged_physics_never_reaches_the_record(tmp_path: Path) -> None:
+    stage = Stage.open(tmp_path, "collect", {})
+    robot = Point(speed=2.0, diverges_at=0.3)
+    r, learner = gather(RandomActions(lanes=16, unroll=8), robot=robot, stage=stage)
+    assert all(np.isfinite(x).all() for x in leaves((r, learner)))
+    assert (~r.valid).any() and r.last[~r.valid].all()
+    counted = [line["diverged"] for line in read_metrics(stage.path(METRICS))]
+    assert sum(counted) * SIZE == pytest.approx((~r.valid).sum())
+
+
+def test_random_actions_cover_what_there_is() -> None:
+    r, _ = gather(RandomActions(lanes=16, unroll=8))
+    assert -1 <= r.a.min() < -0.99 and 0.99 < r.a.max() <= 1
+    assert abs(r.a.mean()) < 0.05 and r.a.std() == pytest.approx(3**-0.5, abs=0.02)
+    other, _ = gather(RandomActions(lanes=16, unroll=8), seed=1)
+    assert not np.isin(other.a, r.a).any()
+
+
+# ── stopping and going on ───────────────────────────────────────────────────────────────
+
+
+class Killed(BaseException):
+    """Stands for kill -9."""
+
+
+def dies_at(call: int) -> Callable:
+    """Progress.advance, up to a call that never returns."""
+    advance, calls = Progress.advance, []
+
+    def dying(self, *args, **kwargs):
+        calls.append(args)
+        if len(calls) == call:
+            raise Killed
+        advance(self, *args, **kwargs)
+
+    return dying
+
+
+@pytest.fixture
+def killed(tmp_path: Path, monkeypatch) -> Callable[[int], Stage]:
+    """A collection with a checkpoint every 2 iterations, killed in a later one."""
+    monkeypatch.setattr(collecting, "CHUNK", 2 * SIZE)
+
+    def at(iteration: int) -> Stage:
+        stage = Stage.open(tmp_path, "collect", {})
+        with monkeypatch.context() as m:
+            m.setattr(Progress, "advance", dies_at(iteration))
+            with pytest.raises(Killed):
+                gather(stage=stage)
+        return stage
+
+    return at
+
+
+def tear(stage: Stage) -> None:
+    newest = stage.checkpoints().steps()[-1]
+    (stage.path("checkpoints") / f"step_{newest:09d}" / "leaves.json").write_text("{")
+
+
+@pytest.mark.parametrize(("iteration", "torn"), [(1, False), (3, False), (5, True)])
+def test_a_killed_collection_goes_on_to_the_same_bits(killed, iteration: int, torn: bool) -> None:
+    stage = killed(iteration)
+    assert stage.checkpoints().steps() == [s for s in (2, 4, 5) if s <= iteration][-2:]
+    if torn:
+        tear(stage)
+    record, learner = gather(stage=stage)
+    assert same((record, learner), undisturbed())
+    assert same(load_chunks(stage.path("experience"), ROBOT), undisturbed()[0])
+    lines = read_metrics(stage.path(METRICS))
+    assert [line["step"] for line in lines] == [SIZE * (i + 1) for i in range(ITERATIONS)]
+
+
+def test_a_collection_that_is_done_is_read_and_not_made_again(killed, monkeypatch) -> None:
+    stage = killed(2)
+    gather(stage=stage)
+    monkeypatch.setattr(Progress, "advance", dies_at(1))
+    assert same(gather(stage=stage), undisturbed())
+
+
+def test_a_collection_goes_on_with_another_number_of_devices(killed) -> None:
+    record, learner = gather(stage=killed(3), mesh=devices.mesh(jax.devices()[:1]))
+    close(record, undisturbed()[0], atol=1e-4)
+    close(learner, undisturbed()[1], atol=1e-3)
+
+
+def test_a_torn_record_is_not_gone_on_from(killed) -> None:
+    stage = killed(3)
+    file = stage.path("experience") / "chunk_00000" / "a.npy"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(store.Torn, match="cut short"):
+        gather(stage=stage)
+
+
+def test_interactions_are_counted_once_and_rounded_up(tmp_path: Path) -> None:
+    stage = Stage.open(tmp_path, "collect", {})
+    agent = RandomActions(lanes=16, unroll=8)
+    record, _ = collect(ROBOT, agent, 3 * SIZE + 1, task=TASK, stage=stage, quiet=True)
+    assert record.interactions == record.s.shape[0] * record.s.shape[1] == 4 * SIZE
+    assert read_metrics(stage.path(METRICS))[-1]["step"] == 4 * SIZE
+    assert record.first_half().interactions == 2 * SIZE
+
+
+# ── bad input ───────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("agent", [PPO(lanes=9, minibatches=3), RandomActions(lanes=9)])
+def test_lanes_that_the_devices_cannot_share_are_refused(agent) -> None:
+    with pytest.raises(BadInput, match="9 lanes cannot be shared among 2 devices"):
+        collect(ROBOT, agent, 100)
+
+
+def test_no_interactions_are_refused() -> None:
+    with pytest.raises(BadInput, match="at least 1"):
+        collect(ROBOT, AGENT, 0)
+
+
+@pytest.mark.parametrize("wrong", [{"lanes": 10, "minibatches": 4}, {"epochs": 0}, {"unroll": 0}])
+def test_settings_that_make_no_ppo_are_refused(wrong: dict) -> None:
+    with pytest.raises(BadInput, match=r"minibatches"):
+        PPO(**wrong)
+
+
+def test_settings_that_make_no_sampling_are_refused() -> None:
+    with pytest.raises(BadInput, match="at least 1"):
+        RandomActions(lanes=0)
