@@ -35,8 +35,11 @@ def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> No
 def _policy(robot: Robot, stage: store.Stage) -> Policy:
     """The last policy of a collecting stage."""
     kept = store.load_json(stage.path("config.json"))["config"]["agent"]
-    given: dict[str, Any] = {f.name: kept[f.name] for f in dataclasses.fields(PPO)}
-    agent = PPO(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+    given: dict[str, Any] = {
+        f.name: tuple(x) if isinstance(x := kept[f.name], list) else x
+        for f in dataclasses.fields(PPO)
+    }
+    agent = PPO(**given)
     learner = jax.eval_shape(agent.learning(robot, WalkForward(), mesh()).start, jax.random.key(0))
     found = stage.checkpoints().latest({"learner": learner, "chunks": 0})
     if found is None:
