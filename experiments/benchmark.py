@@ -22,7 +22,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -40,6 +39,7 @@ from jax.sharding import Mesh
 from mujoco.rollout import Rollout
 from tqdm.auto import tqdm
 
+from experiments import _sb3
 from genidm import controller, devices, evaluate, fit, generalize, store
 from genidm.agents import ppo
 from genidm.agents.base import Agent, Iterate
@@ -60,6 +60,7 @@ from genidm.scenarios import scenarios
 from genidm.store import Stage
 
 T = TypeVar("T")
+Shape = tuple[int, int]
 
 # Steps of a lane in a call of the raw rows, as in an iteration of PPO.
 STEPS = 32
@@ -223,7 +224,9 @@ class Bench:
         command = [sys.executable, "-c", code]
 
         def once() -> dict[str, float]:
-            out = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
+            out = subprocess.run(command, env=environment, stdout=subprocess.PIPE)
+            if out.returncode:
+                raise Skip("a process of its own failed")
             return json.loads(out.stdout.splitlines()[-1])
 
         return once(), once()
@@ -306,7 +309,7 @@ def measure(bench: Bench, rows: Sequence[Row]) -> list[dict[str, Any]]:
 def _skipping(row: Row) -> Iterator[None]:
     try:
         yield
-    except Skip as reason:
+    except (Skip, _sb3.Ended) as reason:
         tqdm.write(f"skipped: {row.name}: {reason}", file=sys.stderr)
 
 
@@ -316,12 +319,14 @@ def _result(
     def full(row: Row) -> str:
         return f"{row.name} ({bench.probe(row).note})"
 
+    # What could not be compared may have been measured all the same, for others' ratios.
+    base = rows[row.ratio_to] if row.ratio_to and row.name in ratios else None
     return {
         "name": full(row),
         "value": _rounded(statistics.median(values)),
         "unit": row.unit,
-        "ratio_to": full(rows[row.ratio_to]) if row.ratio_to else None,
-        "ratio": _rounded(ratios[row.name]) if row.ratio_to else None,
+        "ratio_to": full(base) if base else None,
+        "ratio": _rounded(ratios[row.name]) if base else None,
         "hardware": store.environment()["hardware"],
     }
 
@@ -407,7 +412,8 @@ def unrecorded(bench: Bench) -> Probe:
         iterate, learner = _learning(bench, RL.task, agent)
 
     def step(learner: Any) -> Any:
-        learner, _, metrics = iterate(learner)
+        learner, part, metrics = iterate(learner)
+        assert not jax.tree.leaves(part)
         _read(metrics)
         return learner
 
@@ -523,13 +529,11 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
     They are those of the gradient of a network of the same shape without biases and
     nonlinearities; weights move a little, or XLA would take the products out of the loop.
     """
-    state, latent = bench.robot.observation.size + 3, settings.latent_size
-    psi = (state, *settings.lfm, latent) if latent else ()
-    phi = (latent or state, *settings.idm, bench.robot.action.size)
+    psi, phi = _products(bench.robot, settings)
     keys = jax.random.split(jax.random.key(0), 3)
     weights = _weights(keys[0], psi), _weights(keys[1], phi)
-    views = 2 if latent else 1
-    x = jax.random.normal(keys[2], (views, settings.batch, state))
+    views = 2 if psi else 1
+    x = jax.random.normal(keys[2], (views, settings.batch, (psi or phi)[0][0]))
 
     def loss(weights: tuple[list[jax.Array], list[jax.Array]], x: jax.Array) -> jax.Array:
         gamma = functools.reduce(jnp.matmul, weights[0], x).mean(0)
@@ -542,12 +546,19 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
     return Probe(timed(carried(program, weights), UPDATES), _networks(settings))
 
 
-def _weights(key: jax.Array, sizes: Sequence[int]) -> list[jax.Array]:
-    shapes = list(itertools.pairwise(sizes))
-    keys = jax.random.split(key, max(1, len(shapes)))
+def _products(robot: Robot, settings: Fit) -> tuple[list[Shape], list[Shape]]:
+    """Shapes of the matrices in ψ, if there is one, and in φ."""
+    state, latent = robot.observation.size + 3, settings.latent_size
+    psi = (state, *settings.lfm, latent) if latent else ()
+    phi = (latent or state, *settings.idm, robot.action.size)
+    return list(itertools.pairwise(psi)), list(itertools.pairwise(phi))
+
+
+def _weights(key: jax.Array, shapes: Sequence[Shape]) -> list[jax.Array]:
+    keys = jax.random.split(key, len(shapes)) if shapes else ()
     return [
         jax.random.normal(k, shape) / math.sqrt(shape[0])
-        for k, shape in zip(keys, shapes, strict=False)
+        for k, shape in zip(keys, shapes, strict=True)
     ]
 
 
@@ -560,85 +571,15 @@ def _networks(settings: Fit) -> str:
 # ── others' PPO ─────────────────────────────────────────────────────────────────────────
 
 
-class Baseline(contextlib.AbstractContextManager):
-    """PPO of Stable-Baselines3 in a process of its own.
-
-    Args:
-      environments: number of them.
-      vector: how they are stepped: "DummyVecEnv" in turn, "SubprocVecEnv" in processes.
-      threads: of torch.
-    """
-
-    def __init__(self, environments: int, vector: str, threads: int):
-        self.note = f"{_count(environments, 'environment')} in a {vector}, "
-        self.note += f"torch on {_count(threads, 'thread')}"
-        values = {"environments": environments, "vector": vector, "threads": threads}
-        flags = [text for name, value in values.items() for text in (f"--{name}", str(value))]
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "experiments._sb3", *flags],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        self.steps = self._answer()
-
-    def iterate(self) -> None:
-        """One iteration: `steps` steps in all environments together, and learning."""
-        assert self._process.stdin
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-        self._answer()
-
-    def rate(self, limit: float) -> float:
-        """Steps/s of one iteration; 0 if it takes more than `limit` seconds."""
-        timer, began = threading.Timer(limit, self._process.kill), time.perf_counter()
-        timer.start()
-        try:
-            self.iterate()
-        except RuntimeError:
-            return 0.0
-        finally:
-            timer.cancel()
-        return self.steps / (time.perf_counter() - began)
-
-    def _answer(self) -> int:
-        assert self._process.stdout
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError("Stable-Baselines3 ended before its time")
-        return int(line)
-
-    def __exit__(self, *error: object) -> None:
-        with contextlib.suppress(BrokenPipeError):
-            self._process.communicate()
-
-
 def baseline(bench: Bench) -> Probe:
     """Stable-Baselines3's PPO at its defaults on gymnasium's Ant-v5, at its fastest here."""
-    needed = ("torch", "gymnasium", "stable_baselines3")
-    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    missing = [name for name in _sb3.NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise Skip(f"{', '.join(missing)} missing: pip install -e '.[benchmark]'")
-    fastest = bench.exits.enter_context(Baseline(*_fastest(_candidates())))
-    return Probe(timed(fastest.iterate, fastest.steps), fastest.note)
-
-
-def _candidates() -> list[tuple[int, str, int]]:
-    """Environments, how they are stepped, and threads of torch; it is often best with one."""
-    ways = [(1, "DummyVecEnv")]
-    ways += [(n, vector) for n in (4, 8) for vector in ("DummyVecEnv", "SubprocVecEnv")]
-    return [(*way, threads) for threads in sorted({1, _cores()}) for way in ways]
-
-
-def _fastest(candidates: Iterable[tuple[int, str, int]]) -> tuple[int, str, int]:
-    rates: dict[tuple[int, str, int], float] = {}
-    for candidate in candidates:
-        with Baseline(*candidate) as one:
-            # Threads that fight for busy cores can be fifty times slower: not waited for.
-            best = max(rates.values(), default=0.0)
-            limit = max(10.0, 3 * one.steps / best) if best else 600.0
-            rates[candidate] = one.rate(limit)
-            rate = f"{rates[candidate]:.0f} steps/s" if rates[candidate] else "too slow"
-            tqdm.write(f"Stable-Baselines3, {one.note}: {rate}", file=sys.stderr)
-    return max(rates, key=rates.__getitem__)
+    say = functools.partial(tqdm.write, file=sys.stderr)
+    setting = _sb3.fastest(_sb3.candidates(_cores()), say)
+    agent = bench.exits.enter_context(_sb3.Baseline(*setting))
+    return Probe(timed(agent.iterate, agent.steps), agent.note)
 
 
 # ── starting ────────────────────────────────────────────────────────────────────────────
@@ -702,16 +643,25 @@ def _lanes(n: int) -> str:
     return _count(n, "lane")
 
 
-_P = functools.partial
+_P = functools.partial  # one object a build: rows that share it share what it compiles
+_RAW = _P(raw)
 _PPO = _P(collecting, method=RL)
+
+
+def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
+    """The rows of one number that `start` prints."""
+    first, second = (_P(starting, second=second, what=what) for second in (False, True))
+    base = Row(f"first start, {name}", unit, first, rounds=1)
+    return base, Row(f"second start, {name}", unit, second, base.name, 1)
+
 
 ROWS: tuple[Row, ...] = (
     Row("MuJoCo in C", "steps/s", in_c),
-    Row("raw MJX", "steps/s", _P(raw), "MuJoCo in C"),
+    Row("raw MJX", "steps/s", _RAW, "MuJoCo in C"),
     Row("raw MJX, wide", "steps/s", _P(raw, wide=True), "MuJoCo in C"),
     Row("raw MJX, one device", "steps/s", _P(raw, count=1)),
     Row("raw MJX, two devices", "steps/s", _P(raw, count=2), "raw MJX, one device"),
-    Row("raw MJX, all devices", "steps/s", _P(raw), "raw MJX, one device"),
+    Row("raw MJX, all devices", "steps/s", _RAW, "raw MJX, one device"),
     Row("collecting, random actions", "steps/s", _P(collecting, method=RS), "raw MJX"),
     Row("collecting, PPO", "steps/s", _PPO, "raw MJX"),
     Row("collecting, PPO's stepping alone", "steps/s", walking, "raw MJX"),
@@ -729,23 +679,10 @@ ROWS: tuple[Row, ...] = (
     Row("fit of GE", "updates/s", _P(fitting, settings=GE.fit), "fit of GE, products alone"),
     Row("PPO of Stable-Baselines3 on gymnasium's Ant-v5", "steps/s", baseline),
     Row("PPO", "steps/s", _PPO, "PPO of Stable-Baselines3 on gymnasium's Ant-v5"),
-    Row("first start, compiling", "s", _P(starting, second=False, what="seconds"), rounds=1),
-    Row(
-        "second start, compiling", "s", _P(starting, second=True, what="seconds"),
-        "first start, compiling", 1,
-    ),
-    Row("first start, all", "s", _P(starting, second=False, what="wall"), rounds=1),
-    Row(
-        "second start, all", "s", _P(starting, second=True, what="wall"), "first start, all", 1
-    ),
-    Row(
-        "first start, compiled", "programs", _P(starting, second=False, what="programs"), rounds=1
-    ),
-    Row(
-        "second start, compiled", "programs", _P(starting, second=True, what="programs"),
-        "first start, compiled", 1,
-    ),
-)  # fmt: skip
+    *_starts("compiling", "seconds", "s"),
+    *_starts("all", "wall", "s"),
+    *_starts("compiled", "programs", "programs"),
+)
 
 
 def choose(texts: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Row]:

@@ -125,18 +125,21 @@ def load_chunks(directory: Path, robot: Robot) -> Experience:
     return concatenate([load(path, robot) for path in sorted(directory.glob("chunk_*"))])
 
 
-def goal_step(last: jax.Array, look_ahead: int) -> jax.Array:
-    """The step `[T, B]` whose outcome is the intermediate goal o' of each step.
+def goal_step(last: jax.Array, look_ahead: int) -> tuple[jax.Array, jax.Array]:
+    """Where the intermediate goal o' of each step (Def. 1) lies: `look_ahead` − 1 steps later.
 
-    It lies `look_ahead` − 1 steps later (so 1 is the paper's "next position"), or at the
-    end of the episode or record where that comes first.
+    A step whose episode, or record, ends before that has no such goal. So what led to a fall
+    within the look-ahead is not taken for a way to go anywhere.
 
     Args:
       last: `[T, B]` bool, the last step of an episode.
-      look_ahead: steps, at least 1.
+      look_ahead: steps, at least 1; 1 is the paper's "next position".
+
+    Returns:
+      the step `[T, B]` whose outcome is o', and whether there is one, `[T, B]` bool.
     """
     steps = last.shape[0]
     time = jnp.arange(steps)[:, None]
-    ends = jnp.where(last, time, steps - 1)
-    end = jax.lax.cummin(ends, axis=0, reverse=True)
-    return jnp.minimum(time + look_ahead - 1, end)
+    end = jax.lax.cummin(jnp.where(last, time, steps - 1), axis=0, reverse=True)
+    goal = time + look_ahead - 1
+    return jnp.minimum(goal, end), goal <= end

@@ -275,7 +275,8 @@ def run_cell(robot: Robot, method: Method, options: Options) -> Path:
     from genidm.report.write import report  # drawing is not needed before the end
 
     this = cell(robot, method, options)
-    bank = scenarios(robot, this.scale.seeds, options.episodes or this.scale.episodes)
+    episodes = this.scale.episodes if options.episodes is None else options.episodes
+    bank = scenarios(robot, this.scale.seeds, episodes)
     this.episodes(bank)
     return report(robot, this.root, bank, this.scale.name, options.test, options.results)
 

@@ -342,8 +342,9 @@ def pairs(
       robot: whose layouts say how s and a transform.
       experience: E, `[T, B, ...]`.
       turned: 𝒢(E), or None for the record alone.
-      look_ahead: h, steps to the intermediate goal o'; 1 is the paper's reading. Where o'
-        lies beyond what was replayed in one piece, it is the record's own, turned.
+      look_ahead: h, steps to the intermediate goal o'; 1 is the paper's reading. Steps
+        whose episode ends before are left out. Where o' lies beyond what was replayed in
+        one piece, it is the record's own, turned.
       mirror: adds the reflection y → −y of every sample, in every view.
 
     Raises:
@@ -352,10 +353,10 @@ def pairs(
     if look_ahead < 1:
         raise BadInput(f"look_ahead must be at least 1, not {look_ahead}")
     experience.check(robot.observation.size, robot.action.size)
-    goal = np.asarray(goal_step(jnp.asarray(experience.last), look_ahead))
+    goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.last), look_ahead))
     ahead = np.take_along_axis(np.asarray(experience.o_next), goal[..., None], axis=0)
     views = [(np.asarray(experience.s), ahead - np.asarray(experience.o))]
-    valid = np.asarray(experience.valid)
+    valid = np.asarray(experience.valid) & exists
     for copy in _copies(turned):
         views.append((copy.s, _goal(copy, goal, ahead) - copy.o))
         valid = valid & copy.valid

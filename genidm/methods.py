@@ -29,6 +29,7 @@ class Method:
         and LR make the other half with 𝒢 (A.1.2).
       generalize: settings of 𝒢; None learns from the record alone.
       look_ahead: h, steps to the intermediate goal o'; 1 is the paper's "next position".
+        Steps whose episode ends before are left out.
       mirror: adds the reflection of every sample; not in the paper.
       frame: "heading" turns every input so that the robot faces +x; not in the paper.
       fit: networks and losses.

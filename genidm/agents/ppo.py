@@ -93,10 +93,10 @@ class PPO:
     epochs: int = 7
     minibatches: int = 8
     learning_rate: float = 5e-4
-    discount: float = 0.97
+    discount: float = 0.98
     gae: float = 0.95
     clip: float = 0.2
-    entropy: float = 1e-2
+    entropy: float = 5e-3
     reward_scale: float = 0.1
     hidden: tuple[int, ...] = (64, 64)
     value_hidden: tuple[int, ...] = (64, 64)
@@ -146,7 +146,7 @@ class PPO:
                 mind=Mind(
                     params=params,
                     optimizer=optimizer.init(params),
-                    statistics=running_statistics.init_state(jnp.zeros(robot.observation.size)),
+                    statistics=_statistics(robot.observation.size),
                     key=stream,
                 ),
             )
@@ -213,6 +213,12 @@ class PPO:
             epoch, (mind.params, mind.optimizer), jax.random.split(stream, self.epochs)
         )
         return Mind(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
+
+
+def _statistics(size: int) -> RunningStatisticsState:
+    """Of no states yet; of strong types, as those from a checkpoint: one program serves both."""
+    state = running_statistics.init_state(jnp.zeros(size))
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
 
 def _walk(

@@ -12,6 +12,10 @@ from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
 from genidm.symmetry import Layout
 
 
+# Metres; what the reset noise can lower a foot by (0.1 of height, 0.1 rad at the ankle).
+START_CLEARANCE = 0.15
+
+
 class Ant(MjxRobot):
     """gymnasium's Ant on MJX.
 
@@ -51,7 +55,11 @@ class Ant(MjxRobot):
         )
 
     def rest_pose(self) -> np.ndarray:
-        return self.mj_model.numeric("init_qpos").data.astype(np.float32)
+        pose = self.mj_model.numeric("init_qpos").data.astype(np.float32)
+        # There the feet just touch the floor: noise would put some of them inside it, and the
+        # floor would throw the Ant above its healthy height before its first step is done.
+        pose[2] += START_CLEARANCE
+        return pose
 
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         qpos = physics.qpos.at[3:7].set(symmetry.positive(physics.qpos[3:7]))

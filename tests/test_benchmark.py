@@ -1,0 +1,210 @@
+"""That the benchmark measures what it says, on a robot that costs nothing. No speed is tested."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import re
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point import Point
+
+from experiments import _sb3, benchmark
+from experiments.benchmark import ROWS, Bench, Options, Probe, Row
+from genidm.errors import BadInput
+from genidm.methods import GE, LR
+from genidm.models import Architecture
+
+KEYS = ["name", "value", "unit", "ratio_to", "ratio", "hardware"]
+
+
+@pytest.fixture
+def small(tmp_path, monkeypatch):
+    """Sizes at which every row takes a moment."""
+    for name, size in {"SAMPLES": 600, "CHUNK": 1000, "UPDATES": 2, "STEPS": 3}.items():
+        monkeypatch.setattr(benchmark, name, size)
+    return Options(
+        out=tmp_path / "out" / "benchmark.json", seconds=1e-3, lanes=8, wide=16, bank=(1, 20)
+    )
+
+
+def rows_of(values):
+    """A row for each value: the numbers that it gives, one a sample."""
+
+    def build(name):
+        numbers = iter(values[name])
+        return lambda bench: Probe(lambda seconds: next(numbers), "as told")
+
+    return build
+
+
+def test_every_row_on_a_point(small, monkeypatch, capsys):
+    numbers = {"seconds": 8.0, "wall": 9.0, "programs": 3.0}
+    monkeypatch.setattr(Bench, "starts", (numbers, dict.fromkeys(numbers, 0.5)))
+    # Neither torch nor Stable-Baselines3 needs to be there, so here they never are.
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    results = benchmark.benchmark(Point(), small)
+    assert json.loads(small.out.read_text()) == results
+    assert all(list(r) == KEYS for r in results)
+    assert all(r["value"] > 0 for r in results)
+    skipped = re.findall(r"skipped: (.*?): (.*)", capsys.readouterr().err)
+    # A point is no MuJoCo model, but others are compared with its raw steps all the same.
+    assert {name for name, _ in skipped} == {"raw MJX", "raw MJX, wide", "PPO"}
+    assert "pip install" in dict(skipped)["PPO"]
+    there = {r["name"].partition(" (")[0]: r for r in results}
+    absent = {"MuJoCo in C", "PPO", "PPO of Stable-Baselines3 on gymnasium's Ant-v5"}
+    assert set(there) == {row.name for row in ROWS} - absent
+    compared = {row.name for row in ROWS if row.ratio_to and row.ratio_to != "MuJoCo in C"}
+    assert {n for n, r in there.items() if r["ratio"] is not None} == compared - absent
+    names = {r["name"] for r in results}
+    assert {r["ratio_to"] for r in results} <= names | {None}
+    assert there["second start, compiling"]["ratio"] == 0.5 / 8
+    assert 0 < there["evaluation, useful"]["ratio"] <= 1
+    assert there["evaluation"]["name"] == "evaluation (16 lanes, an untrained controller)"
+    assert there["raw MJX, one device"]["name"].endswith("(8 lanes, 1 device)")
+
+
+def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
+    steps = []
+
+    class Pool(benchmark.Rollout):
+        def rollout(self, model, data, state, control):
+            assert model is ant.mj_model
+            states, sensors = super().rollout(model, data, state, control)
+            steps.append(states[:, -1, 0] - state[:, 0])
+            return states, sensors
+
+    with contextlib.ExitStack() as exits, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "Rollout", Pool)
+        probe = benchmark.in_c(Bench(ant, small, exits))
+        assert probe.sample(1e-3) > 0
+    np.testing.assert_allclose(steps, benchmark.STEPS * ant.control_step)
+    assert np.shape(steps) == (2, small.lanes)  # once to warm up, once timed
+
+
+def test_products_are_those_of_the_networks(ant):
+    for settings in (LR.fit, GE.fit):
+        size = ant.action.size
+        networks = Architecture(size, settings.idm, settings.lfm, settings.latent_size)
+        params = networks.init(jax.random.key(0), ant.observation.size)
+        matrices = [x.shape for x in jax.tree.leaves(params) if x.ndim == 2]
+        psi, phi = benchmark._products(ant, settings)
+        assert sorted(psi + phi) == sorted(matrices)
+
+
+def test_ratio_is_the_median_of_the_pairs(small):
+    values = rows_of({"base": [1.0, 10.0, 100.0], "row": [2.0, 30.0, 400.0]})
+    base = Row("base", "m/s", values("base"))
+    row = Row("row", "m/s", values("row"), ratio_to="base", rounds=3)
+    with contextlib.ExitStack() as exits:
+        bench = Bench(Point(), Options(seconds=60.0), exits)
+        first, second = benchmark.measure(bench, [base, row])
+    assert (first["value"], second["value"], second["ratio"]) == (10.0, 30.0, 3.0)
+    assert (first["ratio_to"], second["ratio_to"]) == (None, "base (as told)")
+
+
+def test_rounds_go_to_and_fro_until_the_seconds_are_over():
+    calls = []
+
+    def probe(name):
+        return Probe(lambda seconds: calls.append((name, seconds)) or float(len(calls)), "")
+
+    both = [probe("a"), probe("b")]
+    np.testing.assert_array_equal(benchmark.interleave(both, 60.0, 3), [[1, 2], [4, 3], [5, 6]])
+    assert [name for name, _ in calls] == list("abbaab")
+    assert {seconds for _, seconds in calls} == {10.0}
+    assert benchmark.interleave(both, 1e-9, 3).shape == (1, 2)
+
+
+def test_timed_counts_whole_calls():
+    calls = []
+    sample = benchmark.timed(lambda: calls.append(0), 5.0)
+    assert len(calls) == 1  # compiled before it is timed
+    began = time.perf_counter()
+    rate, timed_calls = sample(1e-3), len(calls) - 1
+    assert timed_calls >= 1 and rate >= 5.0 * timed_calls / (time.perf_counter() - began)
+
+
+def test_choose_takes_what_a_row_is_compared_with():
+    names = [row.name for row in benchmark.choose(["two devices"])]
+    assert names == ["raw MJX, one device", "raw MJX, two devices"]
+    # A whole name is that row alone.
+    assert {row.name for row in benchmark.choose(["raw MJX"])} == {"MuJoCo in C", "raw MJX"}
+    assert benchmark.choose([]) == list(ROWS)
+    with pytest.raises(BadInput, match=r"no row is called 'nothing'; there are: MuJoCo in C;"):
+        benchmark.choose(["nothing"])
+
+
+def test_rows_name_each_other():
+    names = [row.name for row in ROWS]
+    assert len(set(names)) == len(names)
+    assert {row.ratio_to for row in ROWS} <= {*names, None}
+    assert not any(" (" in name for name in names)  # where the table cuts
+
+
+def test_table():
+    rows = [
+        ("raw (8 lanes)", 12345.6, "steps/s", None, None),
+        ("PPO (8 lanes)", 61.72, "steps/s", "raw (8 lanes)", 0.005),
+    ]
+    results = [dict(zip(KEYS, (*row, "a machine"), strict=True)) for row in rows]
+    assert benchmark.table(results).splitlines() == [
+        "row             value  unit     ratio  to",
+        "─" * 42,
+        "raw (8 lanes)  12,346  steps/s",
+        "PPO (8 lanes)    61.7  steps/s  0.005  raw",
+    ]
+
+
+def test_compiling_counts():
+    with benchmark.compiling() as counted:
+        jax.jit(lambda x: jnp.sin(x) + 41)(1.0)
+    assert 0 < counted["seconds"] < counted["wall"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--rows", "nothing"], "no row is called 'nothing'"),
+        (["--lanes", "7"], "7 lanes cannot be shared among 2 devices"),
+        (["--seconds", "-1"], "seconds must be a number above 0"),
+        (["--out", "."], "is a directory"),
+        (["--run", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
+    monkeypatch.setattr(benchmark, "Ant", Point)
+    monkeypatch.setattr(benchmark, "measure", None)  # not reached
+    with pytest.raises(SystemExit) as stop:
+        benchmark.main()
+    assert stop.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_fastest_baseline_is_taken(monkeypatch):
+    rates = {1: 500.0, 4: 900.0, 8: 0.0}
+
+    class Fake(contextlib.nullcontext):
+        note, steps = "fake", 10
+
+        def __init__(self, environments, vector, threads):
+            super().__init__(self)
+            self.environments = environments
+
+        def rate(self, limit):
+            return rates[self.environments]
+
+    monkeypatch.setattr(_sb3, "Baseline", Fake)
+    settings, said = _sb3.candidates(2), []
+    assert {n for n, _, _ in settings} == {1, 4, 8}
+    assert _sb3.fastest(settings, said.append)[0] == 4
+    assert len(said) == len(settings) and said[-1] == "fake: too slow to wait for"
+    with pytest.raises(_sb3.Ended):
+        _sb3.fastest([(8, "", 1)], said.append)
