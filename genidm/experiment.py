@@ -44,6 +44,8 @@ class Scale:
       updates: share of a method's updates that are made.
       seeds: test seeds.
       episodes: test episodes a seed.
+      look_ahead: most steps to the intermediate goal. Agents that have just begun to learn
+        fall so soon that few of their episodes reach further.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Scale:
     updates: float
     seeds: int
     episodes: int
+    look_ahead: int = 1000
 
 
 def scale_of(text: str, interactions: int) -> Scale:
@@ -66,7 +69,7 @@ def scale_of(text: str, interactions: int) -> Scale:
     if text == "paper":
         return Scale("paper", interactions, 1.0, 10, 1000)
     if text == "quick":
-        return Scale("quick", 250_000, 0.2, 2, 50)
+        return Scale("quick", 200_000, 0.15, 2, 50, look_ahead=25)
     try:
         share = float(text)
     except ValueError:
@@ -256,10 +259,12 @@ def save_test(stage: Stage, outcome: Episodes, ways: list[np.ndarray]) -> None:
 
 def cell(robot: Robot, method: Method, options: Options) -> Cell:
     """The cell that a method and a user's options name."""
+    scale = scale_of(options.scale, robot.paper_interactions)
+    method = literal(method) if options.literal else method
     return Cell(
         robot=robot,
-        method=literal(method) if options.literal else method,
-        scale=scale_of(options.scale, robot.paper_interactions),
+        method=dataclasses.replace(method, look_ahead=min(method.look_ahead, scale.look_ahead)),
+        scale=scale,
         seed=options.seed,
         root=options.out / robot.name,
         test=options.test,

@@ -83,7 +83,7 @@ def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
     with contextlib.ExitStack() as exits, pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark, "Rollout", Pool)
         probe = benchmark.in_c(Bench(ant, small, exits))
-        assert probe.sample(1e-3) > 0
+        assert probe.sample(0.0) > 0
     np.testing.assert_allclose(steps, benchmark.STEPS * ant.control_step)
     assert np.shape(steps) == (2, small.lanes)  # once to warm up, once timed
 
@@ -127,7 +127,7 @@ def test_timed_counts_whole_calls():
     sample = benchmark.timed(lambda: calls.append(0), 5.0)
     assert len(calls) == 1  # compiled before it is timed
     began = time.perf_counter()
-    rate, timed_calls = sample(1e-3), len(calls) - 1
+    rate, timed_calls = sample(1e-4), len(calls) - 1
     assert timed_calls >= 1 and rate >= 5.0 * timed_calls / (time.perf_counter() - began)
 
 

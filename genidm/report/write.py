@@ -70,16 +70,35 @@ def report(
       the directory of the report.
     """
     found = _by_method(tests(root, scale, settings), bank.digest())
-    rows = [_row(name, seeds) for name, seeds in found.items()]
+    material = Material(robot, root, bank, found, [_row(*item) for item in found.items()])
     written = table.results(
-        rows, robot=robot.name, scale=scale, scenarios=bank.digest(),
+        material.rows, robot=robot.name, scale=scale, scenarios=bank.digest(),
         environment=store.environment(),
     )  # fmt: skip
     here = root / f"report-{scale}"
-    for directory, prefix in ((here, ""), (results, f"{robot.name}_")):
-        if directory:
-            _write(directory, prefix, robot, root, bank, rows, found, written)
+    _write(here, "", "results.json", material, written)
+    if results:
+        _write(results, f"{robot.name}_", f"{robot.name}.json", material, written)
     return here
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """What a report is made from.
+
+    Attributes:
+      robot: whose report it is.
+      root: where its stages lie.
+      bank: the scenarios of the table.
+      found: method → its tests, the table's own first.
+      rows: the table's.
+    """
+
+    robot: Robot
+    root: Path
+    bank: Scenarios
+    found: dict[str, list[Tested]]
+    rows: list[Row]
 
 
 def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
@@ -116,34 +135,28 @@ def _row(name: str, seeds: list[Tested]) -> Row:
 
 
 def _write(
-    directory: Path,
-    prefix: str,
-    robot: Robot,
-    root: Path,
-    bank: Scenarios,
-    rows: list[Row],
-    found: dict[str, list[Tested]],
-    written: dict[str, Any],
+    directory: Path, prefix: str, name: str, material: Material, written: dict[str, Any]
 ) -> None:
-    """Table and figures into one directory."""
-    paper = TABLE1.get(robot.name, {})
-    store.save_json(directory / f"{prefix or 'results'}.json".replace("_.", "."), written)
+    """The table as JSON under `name`, as Markdown and text, and the figures."""
+    paper = TABLE1.get(material.robot.name, {})
+    closest = {row.method: stats.masked(row.episodes) for row in material.rows}
+    heading, bearing = _angles(material.robot, material.bank)
+    store.save_json(directory / name, written)
     store.save_text(directory / f"{prefix}table.md", table.markdown(written))
-    figures.violins(rows, directory / f"{prefix}violins.png", paper)
-    figures.paths(_panels(robot, found), directory / f"{prefix}paths.png")
-    heading, bearing = _angles(robot, bank)
-    closest = {row.method: stats.masked(row.episodes) for row in rows}
+    figures.violins(material.rows, directory / f"{prefix}violins.png", paper)
+    figures.paths(_panels(material), directory / f"{prefix}paths.png")
     figures.bearings(closest, bearing, heading, directory / f"{prefix}bearings.png")
-    _curves(directory, prefix, root, found)
+    _curves(directory, prefix, material)
     names = sorted(p.name for p in directory.glob(f"{prefix}*.png"))
     text = f"{table.text(written)}\n\nFigures in {directory}: {', '.join(names)}\n"
     store.save_text(directory / f"{prefix}table.txt", text)
 
 
-def _panels(robot: Robot, found: dict[str, list[Tested]]) -> list[figures.Panel]:
+def _panels(material: Material) -> list[figures.Panel]:
     """Fig. 8: the ways of each method towards targets seen and unseen while learning."""
-    target = np.asarray(tours(robot).target)
-    ways = {name: [w[:, :2] for w in seeds[0].load()[1]] for name, seeds in found.items()}
+    target = np.asarray(tours(material.robot).target)
+    walked = {name: seeds[0].load()[1] for name, seeds in material.found.items()}
+    ways = {name: [w[:, :2] for w in ways] for name, ways in walked.items()}
     return [
         ("as learned", {n: w[:TOUR] for n, w in ways.items()}, target[0, :, :2], 0.0),
         ("turned 135°", {n: w[TOUR:] for n, w in ways.items()}, target[1, :, :2], UNSEEN_YAW),
@@ -165,23 +178,22 @@ def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
     return heading, bearing
 
 
-def _curves(directory: Path, prefix: str, root: Path, found: dict[str, list[Tested]]) -> None:
+def _curves(directory: Path, prefix: str, material: Material) -> None:
     """Learning curves of agents and fits, and the e.m.o. residual of every mode of 𝒢."""
-    agents, fits, modes = {}, {}, {}
-    for stage in sorted(root.glob("experience-*/done.json")):
-        agents[stage.parent.name.rsplit("-", 1)[0].split("-", 1)[1]] = stage.parent
-    for name, seeds in found.items():
-        fits[name] = root / seeds[0].summary["fit"]
-    for stage in sorted(root.glob("replay-*/done.json")):
-        modes[stage.parent.name.split("-")[1]] = store.load_arrays(stage.parent / "residual")[0]
-    curves = {name: _metrics(path) for name, path in agents.items()}
-    figures.learning_curves(
-        curves, directory / f"{prefix}collecting.png", ["reward", "speed"], "interactions"
-    )
-    curves = {name: _metrics(path) for name, path in fits.items()}
-    figures.learning_curves(
-        curves, directory / f"{prefix}fitting.png", ["loss_action", "loss_latent"], "updates"
-    )
+    agents, modes = {}, {}
+    for done in sorted(material.root.glob("experience-*/done.json")):
+        _, agent, seed, _ = done.parent.name.split("-")
+        agents[f"{agent}, seed {seed}"] = _metrics(done.parent)
+    for done in sorted(material.root.glob("replay-*/done.json")):
+        mode = done.parent.name.split("-")[1]
+        modes[mode] = store.load_arrays(done.parent / "residual")[0]
+    fits = {
+        name: _metrics(material.root / seeds[0].summary["fit"])
+        for name, seeds in material.found.items()
+    }
+    collecting, fitting = (directory / f"{prefix}{x}.png" for x in ("collecting", "fitting"))
+    figures.learning_curves(agents, collecting, ["reward", "speed"], "interactions")
+    figures.learning_curves(fits, fitting, ["loss_action", "loss_latent"], "updates")
     if modes:
         figures.residuals(modes, directory / f"{prefix}residual.png")
 

@@ -11,7 +11,6 @@ from genidm.robots.base import State
 from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
 from genidm.symmetry import Layout
 
-
 # Metres; what the reset noise can lower a foot by (0.1 of height, 0.1 rad at the ankle).
 START_CLEARANCE = 0.15
 
