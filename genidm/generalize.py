@@ -387,7 +387,7 @@ def _samples(views: list[tuple[np.ndarray, np.ndarray]], a: np.ndarray, valid: n
     length = np.stack([np.linalg.norm(way, axis=-1) for _, way in views])
     keep = valid & (length > 1e-6).all(axis=0)
     if not keep.any():
-        raise BadInput("no sample of this experience can be learned from")
+        raise BadInput("no sample can be learned from: are all episodes shorter than look_ahead?")
     s = np.stack([s[keep] for s, _ in views])
     d = np.stack([way[keep] for _, way in views]) / length[:, keep, None]
     return Pairs(s, d, a[keep])

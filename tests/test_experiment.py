@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import importlib
 import itertools
 import json
 import os
@@ -33,7 +34,7 @@ from genidm.agents.random import RandomActions
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.evaluate import Test
-from genidm.experiment import Options, cell, run_cell, scale_of
+from genidm.experiment import Options, Scale, cell, run_cell, scale_of
 from genidm.generalize import Generalize
 from genidm.methods import Method, literal
 from genidm.progress import Progress
@@ -110,6 +111,15 @@ def finished(tmp_path_factory) -> Finished:
     return Finished(out, run_cell(Point(), LR, options(out)), done)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_bank() -> Iterator[None]:
+    """Scenarios are drawn once for all cells: they see the robot and two numbers alone."""
+    with pytest.MonkeyPatch.context() as m:
+        draw = functools.cache(lambda name, *numbers: scenarios(Point(), *numbers))
+        m.setattr(experiment, "scenarios", lambda robot, *numbers: draw(robot.name, *numbers))
+        yield
+
+
 @pytest.fixture
 def copy(finished: Finished, tmp_path: Path) -> Path:
     return shutil.copytree(finished.out, tmp_path / "runs")
@@ -172,15 +182,20 @@ def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> N
     assert len(tree["ways"]) == 20 and 0 < row["mean"] < 5
 
 
-def test_a_second_run_does_nothing_again(copy: Path) -> None:
+def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Path, capsys) -> None:
+    """By its command line, which ends with the table, and with results where it is told."""
     before = {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)}
-    was = files(copy)
+    names, results = files(copy).keys(), "point/report-0.5/results.json"
+    was = (copy / results).read_bytes()
     with counted() as calls:
-        run_cell(Point(), LR, options(copy))
-    assert not calls
+        command(copy, "--results", str(tmp_path / "results"))
+    assert not calls and files(copy).keys() == names
     assert {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)} == before
-    assert files(copy).keys() == was.keys()
-    assert files(copy)["point/report-0.5/results.json"] == was["point/report-0.5/results.json"]
+    table = (copy / "point" / "report-0.5" / "table.txt").read_text()
+    assert capsys.readouterr().out == table + "\n"
+    written = files(tmp_path / "results")
+    assert written["point.json"] == (copy / results).read_bytes() == was
+    assert {"point_table.txt", "point_violins.png", "point_paths.png"} <= written.keys()
 
 
 @pytest.mark.parametrize(
@@ -223,13 +238,6 @@ def ran(*args, **kwargs):
     raise Ran
 
 
-def test_results_are_also_written_where_they_are_asked_for(copy: Path, tmp_path: Path) -> None:
-    report = run_cell(Point(), LR, options(copy, results=tmp_path / "results"))
-    written = files(tmp_path / "results")
-    assert written["point.json"] == (report / "results.json").read_bytes()
-    assert {"point_table.txt", "point_violins.png", "point_paths.png"} <= written.keys()
-
-
 def test_the_literal_method_is_the_papers() -> None:
     this = cell(Point(), LR, Options(literal=True)).method
     assert this == literal(LR) and this.name == "LR literal" and this.look_ahead == 1
@@ -241,10 +249,13 @@ def test_the_literal_method_is_the_papers() -> None:
 
 
 def test_scales_are_shares_of_the_paper() -> None:
-    assert dataclasses.astuple(scale_of("paper", 2000)) == ("paper", 2000, 1.0, 10, 1000)
-    assert dataclasses.astuple(scale_of("0.1", 2000)) == ("0.1", 200, 0.1, 10, 100)
-    assert dataclasses.astuple(scale_of("2", 2000)) == ("2", 4000, 1.0, 10, 1000)
-    assert scale_of("quick", 2000).interactions == 250_000
+    assert scale_of("paper", 2000) == Scale("paper", 2000, 1.0, 10, 1000)
+    assert scale_of("0.1", 2000) == Scale("0.1", 200, 0.1, 10, 100)
+    assert scale_of("2", 2000) == Scale("2", 4000, 1.0, 10, 1000)
+    quick = scale_of("quick", 2_000_000)
+    assert quick.interactions < 500_000 and quick.updates < 0.5 and quick.look_ahead < 100
+    this = cell(Point(), dataclasses.replace(LR, look_ahead=999), Options(scale="quick"))
+    assert this.method.look_ahead == quick.look_ahead
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
         with pytest.raises(BadInput, match="--scale"):
             scale_of(wrong, 2000)
@@ -271,14 +282,6 @@ def refused(out: Path, capsys, why: str, *flags: str, **options) -> None:
     assert exit_.value.code == 2 and len(said) == 1 and why in said[0]
     after = files(out) if out.is_dir() else {}
     assert {name: after.get(name) for name in before} == before
-
-
-def test_the_command_ends_with_the_table(copy: Path, capsys) -> None:
-    with counted() as calls:
-        command(copy)
-    assert not calls
-    table = next(copy.glob("point/report-0.5/table.txt")).read_text()
-    assert capsys.readouterr().out == table + "\n"
 
 
 @pytest.mark.parametrize(
@@ -433,6 +436,8 @@ def record(stage: Path) -> dict[str, bytes]:
 
 def run_killed(out: Path, points: list[str]) -> None:
     """Runs the cell in a fork for each point, killed there; then to the end."""
+    for slow in ("orbax.checkpoint", "tensorboardX", "genidm.report.write"):
+        importlib.import_module(slow)  # once for all
     for point in [*points, None]:
         child = os.fork()
         if child == 0:
@@ -475,14 +480,8 @@ def arm(where: str, when: str) -> None:
 
 
 ANT = (
-    "-m",
-    "experiments.ant_lr",
-    "--scale",
-    "0.002",
-    "--episodes",
-    "10",
-    "--test.max-steps",
-    "200",
+    *("-m", "experiments.ant_lr", "--scale", "0.002", "--episodes", "10"),
+    *("--method.look-ahead", "5", "--test.max-steps", "200"),
 )
 
 

@@ -33,6 +33,7 @@ KEY = jax.random.key(3)
 H = 7  # steps of a segment; the record's 30 are no multiple
 MODES = ("segments", "episodes", "rotate")
 ROBOT = Point(speed=2.0, falls_at=0.25)
+STEP, PLACE = jax.jit(ROBOT.step), jax.jit(ROBOT.place)
 
 
 @functools.cache
@@ -66,13 +67,13 @@ def actions(count: int = 9) -> jax.Array:
 
 def test_a_turned_or_mirrored_point_goes_the_turned_or_mirrored_way() -> None:
     before, a, yaw = states(), actions(), jnp.linspace(-3.0, 2.0, 9)
-    after = ROBOT.step(before, a)
-    turn = ROBOT.step(ROBOT.place(before.physics, yaw), a)
+    after = STEP(before, a)
+    turn = STEP(PLACE(before.physics, yaw), a)
     close(turn.position, symmetry.turn_vector(after.position, yaw))
     close(turn.observation, ROBOT.observation.turn(after.observation, yaw))
     close(symmetry.wrap(turn.heading - after.heading - yaw), 0)
-    across = ROBOT.place(ROBOT.mirror_physics(before.physics), 0 * yaw)
-    across = ROBOT.step(across, ROBOT.action.mirror(a))
+    across = PLACE(ROBOT.mirror_physics(before.physics), 0 * yaw)
+    across = STEP(across, ROBOT.action.mirror(a))
     close(across.position, after.position * np.asarray([[1, -1, 1]]))
     close(across.observation, ROBOT.observation.mirror(after.observation))
     assert np.abs(after.position - before.position).max() > 0.05
@@ -273,8 +274,8 @@ def test_mirrored_samples_are_samples_of_the_mirrored_robot() -> None:
     np.testing.assert_array_equal(across, a * [1, -1, -1])
     # The mirrored robot, told the mirrored action, goes the mirrored way.
     flat = jax.tree.map(lambda x: x.reshape(150, *x.shape[2:]), r.physics)
-    before = ROBOT.place(ROBOT.mirror_physics(flat), jnp.zeros(150))
-    way = ROBOT.step(before, jnp.asarray(across)).position - before.position
+    before = PLACE(jax.jit(ROBOT.mirror_physics)(flat), jnp.zeros(150))
+    way = STEP(before, jnp.asarray(across)).position - before.position
     close(samples.d[0, 150:], way / np.linalg.norm(way, axis=-1, keepdims=True), atol=1e-4)
     s = np.asarray(samples.s[:, 150:])
     np.testing.assert_array_equal(s[..., 8:], samples.s[:, :150, [9, 8]])
