@@ -76,8 +76,14 @@ def scale_of(text: str, interactions: int) -> Scale:
         share = 0.0
     if not 0 < share < float("inf"):
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
-    episodes = max(10, round(1000 * min(share, 1.0)))
-    return Scale(text, max(1, round(interactions * share)), min(share, 1.0), 10, episodes)
+    return Scale(
+        name=text,
+        interactions=max(1, round(interactions * share)),
+        updates=min(share, 1.0),
+        seeds=10,
+        episodes=max(10, round(1000 * min(share, 1.0))),
+        look_ahead=1000 if share > 0.2 else 25,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +220,7 @@ class Cell:
                     "interactions": self._count(self.experience_stage, "interactions"),
                     "learned_from": record.interactions,
                     "replayed": self._count(self.replay_stage, "replayed"),
-                    "settings": store.plain(m),
+                    "settings": store.plain(dataclasses.replace(m, fit=self._fit)),
                 }
             )
             stage.clear_checkpoints()
