@@ -28,6 +28,9 @@ from genidm.robots.base import Robot, State, select
 
 Mode = Literal["segments", "episodes", "rotate"]
 
+# How d transforms is declared as everything else is.
+DIRECTION = symmetry.vector("direction", unit="1")
+
 
 @dataclasses.dataclass(frozen=True)
 class Generalize:
@@ -395,16 +398,13 @@ def _samples(views: list[tuple[np.ndarray, np.ndarray]], a: np.ndarray, valid: n
 
 def with_reflection(robot: Robot, samples: Pairs) -> Pairs:
     """The samples and their reflections y → −y, 2N in all."""
-    across = Pairs(
-        s=robot.observation.mirror(samples.s),
-        d=samples.d * np.asarray([1, -1, 1], np.float32),
-        a=robot.action.mirror(samples.a),
-    )
-    join = lambda x, y, axis: np.concatenate([x, np.asarray(y)], axis=axis)  # noqa: E731
+    s = np.asarray(robot.observation.mirror(samples.s))
+    d = np.asarray(DIRECTION.mirror(samples.d))
+    a = np.asarray(robot.action.mirror(samples.a))
     return Pairs(
-        s=join(samples.s, across.s, 1),
-        d=join(samples.d, across.d, 1),
-        a=join(samples.a, across.a, 0),
+        s=np.concatenate([samples.s, s], axis=1),
+        d=np.concatenate([samples.d, d], axis=1),
+        a=np.concatenate([samples.a, a], axis=0),
     )
 
 

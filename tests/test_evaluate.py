@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from killing import Killed, dies_at
 from point import Point, Straight
 
 from genidm import devices, stats, store
@@ -160,10 +161,6 @@ def test_one_lane_wastes_no_step(tmp_path: Path) -> None:
     assert last["step"] == SEEDS * EPISODES
 
 
-class Killed(BaseException):
-    """Stands for kill -9."""
-
-
 @pytest.mark.parametrize("cores", [2, 1])
 def test_a_killed_test_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch, cores: int) -> None:
     """With another number of devices it begins anew, as its queues belong to the devices."""
@@ -185,19 +182,6 @@ def test_a_killed_test_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch, cor
     steps = [line["step"] for line in read_metrics(stage.path(METRICS))]
     assert steps == sorted(steps) and steps[-1] == SEEDS * EPISODES
     assert len(calls) == len(steps) - 2 * (cores == 2)
-
-
-def dies_at(call: int):
-    """Progress.advance, up to a call that never returns."""
-    advance, calls = Progress.advance, []
-
-    def dying(self, *args, **kwargs):
-        calls.append(args)
-        if len(calls) == call:
-            raise Killed
-        advance(self, *args, **kwargs)
-
-    return dying
 
 
 @pytest.mark.parametrize("wrong", [{"lanes": 0}, {"max_steps": 0}, {"chunk": 0}, {"reach": -0.1}])

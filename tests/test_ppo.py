@@ -14,6 +14,7 @@ import pytest
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.losses import compute_ppo_loss
 from brax.training.types import Transition
+from killing import Killed, dies_at
 from point import Point
 
 from genidm import collect as collecting
@@ -308,23 +309,6 @@ def test_random_actions_cover_what_there_is() -> None:
 
 
 # ── stopping and going on ───────────────────────────────────────────────────────────────
-
-
-class Killed(BaseException):
-    """Stands for kill -9."""
-
-
-def dies_at(call: int) -> Callable:
-    """Progress.advance, up to a call that never returns."""
-    advance, calls = Progress.advance, []
-
-    def dying(self, *args, **kwargs):
-        calls.append(args)
-        if len(calls) == call:
-            raise Killed
-        advance(self, *args, **kwargs)
-
-    return dying
 
 
 @pytest.fixture
