@@ -7,11 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from genidm import controller, store
+from genidm import controller
+from genidm.config import environment
 from genidm.evaluate import Test, evaluate
 from genidm.experiment import guarded
 from genidm.report import Row, results, text
 from genidm.scenarios import scenarios
+from genidm.store import Stage
 
 
 def main(
@@ -30,7 +32,7 @@ def main(
       first_seed: the first of the test seeds; another one gives unseen scenarios.
       test: settings of the test.
     """
-    fitted = store.Stage(run).summary()
+    fitted = Stage(run).summary()
     model = controller.load(run / "controller")
     bank = scenarios(model.robot, seeds, episodes, first_seed)
     row = Row(
@@ -42,7 +44,7 @@ def main(
     )
     written = results(
         [row], robot=model.robot.name, scale="test", scenarios=bank.digest(),
-        environment=store.environment(),
+        environment=environment(),
     )  # fmt: skip
     print(text(written))
 

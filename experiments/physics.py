@@ -24,7 +24,8 @@ import numpy as np
 import tyro
 from mujoco.rollout import Rollout
 
-from genidm import devices, store, symmetry
+from genidm import devices, files, symmetry
+from genidm.config import environment
 from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.progress import Progress, compiled
@@ -324,9 +325,9 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
         "load": [before, os.getloadavg()[0]],
         "stability": stable,
         "drift": turned,
-        **store.environment(),
+        **environment(),
     }
-    store.save_json(options.out, results)
+    files.save_json(options.out, results)
     print(f"{stability_table(stable)}\n\n{drift_table(turned)}")
 
 

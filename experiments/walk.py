@@ -9,13 +9,14 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from genidm import store
+from genidm import files
 from genidm.agents.ppo import PPO, Learner, Policy
 from genidm.devices import mesh
 from genidm.errors import BadInput
 from genidm.evaluate import walking_speed
 from genidm.experiment import guarded
 from genidm.robots import Robot, by_name
+from genidm.store import Stage
 from genidm.tasks import WalkForward
 
 
@@ -28,13 +29,13 @@ def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> No
     """
     robot = by_name(root.name)
     for path in sorted(root.glob("experience-PPO-*")):
-        speed = walking_speed(robot, _policy(robot, store.Stage(path)), episodes)
+        speed = walking_speed(robot, _policy(robot, Stage(path)), episodes)
         print(f"{path.name}: {speed.mean():.2f} m/s, {speed.std():.2f} between episodes")
 
 
-def _policy(robot: Robot, stage: store.Stage) -> Policy:
+def _policy(robot: Robot, stage: Stage) -> Policy:
     """The last policy of a collecting stage."""
-    kept = store.load_json(stage.path("config.json"))["config"]["agent"]
+    kept = files.load_json(stage.path("config.json"))["config"]["agent"]
     given: dict[str, Any] = {
         f.name: tuple(x) if isinstance(x := kept[f.name], list) else x
         for f in dataclasses.fields(PPO)

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from genidm import store, symmetry
+from genidm import files, symmetry
+from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.models import Architecture
 from genidm.robots import Robot, by_name
@@ -86,8 +87,8 @@ class Controller(flax.struct.PyTreeNode):
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
-        meta = {"robot": self.robot.name, "frame": self.frame} | store.plain(self.architecture)
-        store.save_arrays(path, leaves, meta, overwrite)
+        meta = {"robot": self.robot.name, "frame": self.frame} | plain(self.architecture)
+        files.save_arrays(path, leaves, meta, overwrite)
 
 
 def load(path: Path, robot: Robot | None = None) -> Controller:
@@ -100,7 +101,7 @@ def load(path: Path, robot: Robot | None = None) -> Controller:
     Raises:
       BadInput: the directory is torn, or the controller is another robot's.
     """
-    tree, meta = store.load_arrays(path)
+    tree, meta = files.load_arrays(path)
     if tree.keys() != {"params", "mean", "std"}:
         raise BadInput(f"{path} holds no controller")
     robot = robot or by_name(meta["robot"])

@@ -66,7 +66,7 @@ class Outcome(flax.struct.PyTreeNode):
     path_length: jax.Array
 
 
-class _Queue(flax.struct.PyTreeNode):
+class Queue(flax.struct.PyTreeNode):
     """One device's share: its lanes `[L]`, its scenarios `[n]`, its results `[n]`.
 
     Attributes:
@@ -165,30 +165,24 @@ def run(
     Returns:
       outcomes `[N]`, and for each traced episode its positions `[steps + 1, 3]`.
     """
-    settings, mesh = settings or Test(), mesh or devices.mesh()
-    queue, shares = _queues(robot, bank, settings, traced, mesh)
+    testing = Testing(robot, bank, settings or Test(), mesh or devices.mesh(), traced)
+    queue, calls = testing.start(), 0
     # Its queues belong to the devices: with another number of them the test begins anew.
-    checkpoints = stage.checkpoints(f"{mesh.size}_devices") if stage else None
+    checkpoints = stage.checkpoints(f"{testing.mesh.size}_devices") if stage else None
     found = checkpoints.latest(queue) if checkpoints else None
-    calls, queue = (found[0], devices.put(found[1], mesh)) if found else (0, queue)
-    controller = devices.put(controller, mesh, None)
-    body = functools.partial(_chunk, robot, settings)
-    sharded = devices.over_lanes(body, mesh, [None, 0, 0], 0)
-    program = compiled("evaluation", jax.jit(sharded, donate_argnums=1), controller, queue, shares)
-    total = bank.yaw.shape[0]
-    done = _count(queue, total, mesh)
+    if found:
+        calls, queue = found[0], devices.put(found[1], testing.mesh)
+    step = testing.prepare(controller, queue)
+    done = testing.ended(queue)
     directory = stage.directory if stage else None
-    with Progress("evaluate", total, "episodes", directory, done, quiet) as bar:
-        while done < total:
-            queue = program(controller, queue, shares)
-            calls += 1
-            before, done = done, _count(queue, total, mesh)
-            bar.advance(done - before, useful=_useful(queue, settings, calls, mesh))
+    with Progress("evaluate", testing.total, "episodes", directory, done, quiet) as bar:
+        while done < testing.total:
+            queue, calls = step(queue), calls + 1
+            before, done = done, testing.ended(queue)
+            bar.advance(done - before, useful=testing.useful(queue, calls))
             if checkpoints and checkpoints.due():
                 checkpoints.save(calls, queue)
-    outcome = jax.tree.map(lambda x: _in_order(x, mesh)[:total], queue.ended)
-    ways = _in_order(queue.ways, mesh)
-    return outcome, [ways[i, : outcome.steps[i] + 1] for i in range(traced)]
+    return testing.outcome(queue), testing.ways(queue)
 
 
 def flatten(*banks: Scenarios) -> Scenarios:
@@ -206,37 +200,97 @@ def episodes(outcome: Outcome, shape: tuple[int, int]) -> Episodes:
     return Episodes(**{name: np.asarray(getattr(outcome, name)).reshape(shape) for name in names})
 
 
-def _queues(
-    robot: Robot, bank: Scenarios, settings: Test, traced: int, mesh: Mesh
-) -> tuple[_Queue, Scenarios]:
-    """Idle lanes, and the scenarios dealt out to the devices in turn, short shares filled up."""
-    count, total = mesh.size, bank.yaw.shape[0]
-    share = -(-total // count)
-    lanes = count * min(-(-settings.lanes // count), share)
-    dealt = np.minimum(np.arange(share * count), total - 1).reshape(share, count).T.reshape(-1)
-    # One a device at least: jax forgets how an array without elements is shared out.
-    rows = count * max(1, -(-traced // count))
-    shapes = jax.eval_shape(
-        robot.reset, jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes)
-    )
-    queue = _Queue(
-        robots=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
-        target=jnp.zeros((lanes, 3)),
-        episode=jnp.full(lanes, share, jnp.int32),
-        now=_nothing(lanes),
-        ended=_nothing(share * count),
-        taken=jnp.zeros(count, jnp.int32),
-        ways=jnp.zeros((rows, settings.max_steps + 1, 3)),
-    )
-    shares = jax.tree.map(lambda x: x[dealt], bank)
-    return devices.put(queue, mesh), devices.put(shares, mesh)
+@dataclasses.dataclass(frozen=True)
+class Testing:
+    """A test at work: a bank of scenarios shared out over the devices.
 
+    Attributes:
+      robot: what is steered.
+      bank: scenarios `[N]`.
+      settings: of the test.
+      mesh: devices that the lanes and scenarios are shared among.
+      traced: how many of the first episodes leave their ways in the queue.
+    """
 
-def _in_order(x: jax.Array, mesh: Mesh) -> np.ndarray:
-    """Undoes the dealing out: `[devices × n, ...]` in the order of the bank."""
-    dealt = np.asarray(x)
-    rows = dealt.reshape(mesh.size, -1, *dealt.shape[1:])
-    return rows.swapaxes(0, 1).reshape(dealt.shape)
+    __test__ = False  # not a test case for pytest
+
+    robot: Robot
+    bank: Scenarios
+    settings: Test
+    mesh: Mesh
+    traced: int = 0
+
+    @property
+    def total(self) -> int:
+        """Episodes in the bank, N."""
+        return self.bank.yaw.shape[0]
+
+    @property
+    def share(self) -> int:
+        """Scenarios of a device, n; the bank is filled up to n a device."""
+        return -(-self.total // self.mesh.size)
+
+    def start(self) -> Queue:
+        """Queues whose lanes are all idle, on the devices."""
+        count, share = self.mesh.size, self.share
+        lanes = count * min(-(-self.settings.lanes // count), share)
+        # One a device at least: jax forgets how an array without elements is shared out.
+        rows = count * max(1, -(-self.traced // count))
+        shapes = jax.eval_shape(
+            self.robot.reset, jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes)
+        )
+        queue = Queue(
+            robots=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
+            target=jnp.zeros((lanes, 3)),
+            episode=jnp.full(lanes, share, jnp.int32),
+            now=_nothing(lanes),
+            ended=_nothing(share * count),
+            taken=jnp.zeros(count, jnp.int32),
+            ways=jnp.zeros((rows, self.settings.max_steps + 1, 3)),
+        )
+        return devices.put(queue, self.mesh)
+
+    def prepare(self, controller: Steering, queue: Queue) -> Callable[[Queue], Queue]:
+        """The compiled program of `settings.chunk` steps of every lane; it donates the queue."""
+        controller = devices.put(controller, self.mesh, None)
+        shares = devices.put(self._dealt(), self.mesh)
+        body = functools.partial(_chunk, self.robot, self.settings)
+        sharded = devices.over_lanes(body, self.mesh, [None, 0, 0], 0)
+        jitted = jax.jit(sharded, donate_argnums=1)
+        program = compiled("evaluation", jitted, controller, queue, shares)
+        return lambda queue: program(controller, queue, shares)
+
+    def ended(self, queue: Queue) -> int:
+        """Episodes that have ended, those that fill up a share not counted."""
+        return int((self._in_order(queue.ended.steps)[: self.total] > 0).sum())
+
+    def useful(self, queue: Queue, calls: int) -> float:
+        """Share of the lane-steps of so many calls that were spent in episodes."""
+        running = np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0)
+        steps = np.asarray(queue.ended.steps).sum() + running.sum()
+        return float(steps / (calls * self.settings.chunk * queue.episode.shape[0]))
+
+    def outcome(self, queue: Queue) -> Outcome:
+        """Outcomes `[N]`, in the order of the bank."""
+        return jax.tree.map(lambda x: self._in_order(x)[: self.total], queue.ended)
+
+    def ways(self, queue: Queue) -> list[np.ndarray]:
+        """Positions `[steps + 1, 3]` in each traced episode, metres."""
+        steps, ways = self._in_order(queue.ended.steps), self._in_order(queue.ways)
+        return [ways[i, : steps[i] + 1] for i in range(self.traced)]
+
+    def _dealt(self) -> Scenarios:
+        """Scenarios `[devices × n]`, dealt out to the devices in turn, short shares filled up."""
+        count, share = self.mesh.size, self.share
+        dealt = np.minimum(np.arange(share * count), self.total - 1)
+        dealt = dealt.reshape(share, count).T.reshape(-1)
+        return jax.tree.map(lambda x: x[dealt], self.bank)
+
+    def _in_order(self, x: jax.Array) -> np.ndarray:
+        """Undoes the dealing out: `[devices × n, ...]` in the order of the bank."""
+        dealt = np.asarray(x)
+        rows = dealt.reshape(self.mesh.size, -1, *dealt.shape[1:])
+        return rows.swapaxes(0, 1).reshape(dealt.shape)
 
 
 def _nothing(count: int) -> Outcome:
@@ -248,25 +302,12 @@ def _nothing(count: int) -> Outcome:
     )
 
 
-def _count(queue: _Queue, total: int, mesh: Mesh) -> int:
-    """Episodes that have ended, those that fill up a share not counted."""
-    return int((_in_order(queue.ended.steps, mesh)[:total] > 0).sum())
-
-
-def _useful(queue: _Queue, settings: Test, calls: int, mesh: Mesh) -> float:
-    """Share of the lane-steps so far that were spent in episodes."""
-    idle = queue.ended.steps.shape[0] // mesh.size
-    running = np.where(np.asarray(queue.episode) < idle, queue.now.steps, 0)
-    steps = np.asarray(queue.ended.steps).sum() + running.sum()
-    return float(steps / (calls * settings.chunk * queue.episode.shape[0]))
-
-
 def _chunk(
-    robot: Robot, settings: Test, controller: Steering, queue: _Queue, shares: Scenarios
-) -> _Queue:
+    robot: Robot, settings: Test, controller: Steering, queue: Queue, shares: Scenarios
+) -> Queue:
     """`settings.chunk` steps of one device's lanes."""
 
-    def step(queue: _Queue, _: None) -> tuple[_Queue, None]:
+    def step(queue: Queue, _: None) -> tuple[Queue, None]:
         queue = _take(robot, queue, shares)
         return _step(robot, settings, controller, queue), None
 
@@ -274,7 +315,7 @@ def _chunk(
     return queue
 
 
-def _take(robot: Robot, queue: _Queue, shares: Scenarios) -> _Queue:
+def _take(robot: Robot, queue: Queue, shares: Scenarios) -> Queue:
     """Idle lanes take the next scenarios of the queue, while there are any."""
     total = shares.yaw.shape[0]
     idle = queue.episode >= total
@@ -296,7 +337,7 @@ def _take(robot: Robot, queue: _Queue, shares: Scenarios) -> _Queue:
     )
 
 
-def _step(robot: Robot, settings: Test, controller: Steering, queue: _Queue) -> _Queue:
+def _step(robot: Robot, settings: Test, controller: Steering, queue: Queue) -> Queue:
     """One step of every lane; what ended is written down, and its lane is idle."""
     before = queue.robots
     action = controller(before.observation, queue.target - before.position)

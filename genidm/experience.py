@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from genidm import store
+from genidm import files
 from genidm.errors import BadInput
 from genidm.robots.base import Robot
 from genidm.tasks import Step
@@ -60,7 +60,7 @@ class Experience(flax.struct.PyTreeNode):
         """Writes the record as a directory of arrays, without pickle."""
         tree = flax.serialization.to_state_dict(self)
         there = {name: x for name, x in tree.items() if x is not None}
-        store.save_arrays(path, there, {}, overwrite=True)
+        files.save_arrays(path, there, {}, overwrite=True)
 
     def check(self, state_size: int, action_size: int) -> None:
         """Refuses a record that cannot be learned from.
@@ -106,7 +106,7 @@ def load(path: Path, robot: Robot) -> Experience:
     Raises:
       BadInput: the directory is torn, or the record is another robot's.
     """
-    tree, _ = store.load_arrays(path)
+    tree, _ = files.load_arrays(path)
     if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
         raise BadInput(f"{path} holds no experience")
     experience = Experience(**tree)

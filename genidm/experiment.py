@@ -19,8 +19,9 @@ import jax
 import numpy as np
 import tyro
 
-from genidm import controller, experience, store
+from genidm import controller, experience, files
 from genidm.collect import collect
+from genidm.config import plain
 from genidm.controller import Controller
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
@@ -182,7 +183,7 @@ class Cell:
         if not stage.done:
             turned = replay(self.robot, record, self._key(1), self.method.generalize)
             turned.save(stage.path("replay"))
-            store.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
+            files.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
             stage.finish({"replayed": turned.yaw.size})
         return Replay.load(stage.path("replay"))
 
@@ -223,7 +224,7 @@ class Cell:
                     "interactions": self._count(self.experience_stage, "interactions"),
                     "learned_from": record.interactions,
                     "replayed": self._count(self.replay_stage, "replayed"),
-                    "settings": store.plain(dataclasses.replace(m, fit=self._fit)),
+                    "settings": plain(dataclasses.replace(m, fit=self._fit)),
                 }
             )
             stage.clear_checkpoints()
@@ -251,7 +252,7 @@ class Cell:
             stage.finish(
                 self.fit_stage.summary()
                 | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
-                | {"test": store.plain(self.test), "fit": self.fit_stage.directory.name}
+                | {"test": plain(self.test), "fit": self.fit_stage.directory.name}
             )
             stage.clear_checkpoints()
         return stage
@@ -263,7 +264,7 @@ def save_test(stage: Stage, outcome: Episodes, ways: list[np.ndarray]) -> None:
         "episodes": dataclasses.asdict(outcome),
         "ways": {str(i): w for i, w in enumerate(ways)},
     }
-    store.save_arrays(stage.path("episodes"), tree, {}, overwrite=True)
+    files.save_arrays(stage.path("episodes"), tree, {}, overwrite=True)
 
 
 def cell(robot: Robot, method: Method, options: Options) -> Cell:

@@ -147,13 +147,11 @@ def fit(
     if settings.latent_size is not None and samples.s.shape[0] < 2:
         raise BadInput("an LFM is fitted to pairs, and these samples have one view only")
     samples = jax.jit(functools.partial(_framed, robot, frame))(_on_first_device(samples))
-    learner = _start(robot, samples, key, settings, frame)
+    learner, updates = training(robot, samples, key, settings, frame)
     checkpoints = stage.checkpoints() if stage else None
     found = checkpoints.latest(learner) if checkpoints else None
     done, learner = (found[0], _on_first_device(found[1])) if found else (0, learner)
-    program = compiled(
-        "fit", jax.jit(_updates(settings), donate_argnums=0), learner, samples, jnp.int32(0)
-    )
+    program = compiled("fit", updates, learner, samples, jnp.int32(0))
     directory = stage.directory if stage else None
     with Progress("fit", settings.updates, "updates", directory, done, quiet) as bar:
         while done < settings.updates:
@@ -164,6 +162,26 @@ def fit(
             if checkpoints and checkpoints.due():
                 checkpoints.save(done, learner)
     return learner.model
+
+
+def training(
+    robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: Frame = "world"
+) -> tuple[Learner, Any]:
+    """A fit before its first update, and the program of its updates.
+
+    Args:
+      robot: whose states and actions the samples hold.
+      samples: `[V, N, ...]`, with s and d in `frame` already, on one device.
+      key: of the parameters and the minibatches.
+      settings: networks, losses, schedule.
+      frame: the frame that the controller turns what it is given into.
+
+    Returns:
+      the learner, and the jitted (learner, samples, count) → (learner, mean losses) of
+      `count` updates, which donates the learner.
+    """
+    learner = _start(robot, samples, key, settings, frame)
+    return learner, jax.jit(_updates(settings), donate_argnums=0)
 
 
 def _on_first_device(tree: Any) -> Any:
@@ -193,7 +211,7 @@ def _start(robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: F
 
 
 def _updates(settings: Fit) -> Any:
-    """The program (learner, samples, count) → (learner, mean losses) of `count` updates."""
+    """The function (learner, samples, count) → (learner, mean losses) of `count` updates."""
     siamese = settings.latent_size is not None
     draw = draw_siamese if siamese else draw_plain
     loss = (

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from genidm import devices, store, symmetry
+from genidm import devices, files, symmetry
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
 from genidm.progress import Progress, compiled
@@ -77,12 +77,12 @@ class Replay(flax.struct.PyTreeNode):
     def save(self, path: Path) -> None:
         """Writes the replay as a directory of arrays, without pickle."""
         tree = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        store.save_arrays(path, tree, {}, overwrite=True)
+        files.save_arrays(path, tree, {}, overwrite=True)
 
     @classmethod
     def load(cls, path: Path) -> Replay:
         """A replay that `save` wrote; raises BadInput if it is torn."""
-        return cls(**store.load_arrays(path)[0])
+        return cls(**files.load_arrays(path)[0])
 
 
 class Pairs(flax.struct.PyTreeNode):
@@ -101,7 +101,7 @@ class Pairs(flax.struct.PyTreeNode):
     a: Any
 
 
-class _Cursor(flax.struct.PyTreeNode):
+class Cursor(flax.struct.PyTreeNode):
     """Robots in the middle of a replay, and the yaw that each is turned by."""
 
     robots: State
@@ -138,16 +138,15 @@ def replay(
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
-    placed = _placements(np.asarray(experience.first), settings)
     mesh = mesh or devices.mesh()
-    blocks = _Blocks(experience, placed, settings, mesh.size)
-    run = _Runner(robot, mesh, blocks.example(key))
+    blocks = Blocks(experience, settings, mesh.size)
+    runner = Runner(robot, mesh, blocks.example(key))
     copies = []
     with Progress("generalize", settings.copies * blocks.total, "steps", quiet=quiet) as bar:
         for copy_key in jax.random.split(key, settings.copies):
-            copies.append(blocks.gather(run.over(blocks, copy_key, bar)))
+            copies.append(blocks.gather(runner.over(blocks, copy_key, bar)))
     s, o, o_next, yaw, valid = (np.stack(x) for x in zip(*copies, strict=True))
-    return Replay(s, o, o_next, yaw, _last_placed(placed), valid)
+    return Replay(s, o, o_next, yaw, _last_placed(blocks.placed), valid)
 
 
 def rotate(robot: Robot, experience: Experience, key: jax.Array, copies: int = 1) -> Replay:
@@ -181,17 +180,28 @@ def _last_placed(placed: np.ndarray) -> np.ndarray:
 Block = dict[str, Any]
 
 
-class _Blocks:
+class Blocks:
     """A record cut into blocks `[H, lanes]` of equal size, and put together again.
 
     In mode "segments" each column of a block is a segment, and blocks are independent.
     In mode "episodes" the columns are the record's lanes, and blocks follow one another.
+    Iterating gives the blocks, trees of arrays on the host.
+
+    Args:
+      experience: E, `[T, B, ...]`, with its physics.
+      settings: mode, segment length and lanes.
+      devices: a block's lanes are a multiple of their number.
+
+    Attributes:
+      placed: `[T, B]` bool, where the robot is placed on the record.
+      length: steps of a block, H.
+      width: lanes of a block.
+      follow: whether blocks follow one another.
     """
 
-    def __init__(
-        self, experience: Experience, placed: np.ndarray, settings: Generalize, devices: int
-    ):
-        steps, lanes = placed.shape
+    def __init__(self, experience: Experience, settings: Generalize, devices: int):
+        self.placed = _placements(np.asarray(experience.first), settings)
+        steps, lanes = self.placed.shape
         self.length = settings.segment
         self.shape = (-(-steps // self.length), lanes)
         self.steps = steps
@@ -201,7 +211,7 @@ class _Blocks:
         self.width = -(-width // devices) * devices
         source = dict(
             physics=experience.physics, s=experience.s, a=experience.a,
-            placed=placed, valid=experience.valid,
+            placed=self.placed, valid=experience.valid,
         )  # fmt: skip
         self.columns = jax.tree.map(lambda x: self._cut(np.asarray(x)), source)
 
@@ -245,29 +255,40 @@ class _Blocks:
         return [join(*parts) for parts in zip(*outputs, strict=True)]
 
 
-class _Runner:
-    """The compiled replay of one block, its lanes sharded over the mesh."""
+class Runner:
+    """The compiled replay of one block, its lanes sharded over the mesh.
+
+    Args:
+      robot: whose record is replayed.
+      mesh: devices that share the lanes.
+      example: keys and a block of the shapes to compile for (`Blocks.example`).
+
+    Attributes:
+      program: the compiled (cursor, block on the devices) → (cursor, outputs on the
+        devices): s, o, o', yaw and valid, `[H, lanes, ...]`.
+    """
 
     def __init__(self, robot: Robot, mesh: Mesh, example: tuple[jax.Array, Block]):
         self.robot, self.mesh = robot, mesh
         keys, block = example
-        cursor = self._start(keys, block)
+        cursor = self.start(keys, block)
         sharded = devices.over_lanes(self._replay, mesh, [0, 1], (0, 1))
-        self.program = compiled("generalize", jax.jit(sharded), cursor, self._put(block))
+        self.program = compiled("generalize", jax.jit(sharded), cursor, self.put(block))
 
-    def _put(self, block: Block) -> Block:
+    def put(self, block: Block) -> Block:
+        """A block on the devices."""
         return devices.put(block, self.mesh, axis=1)
 
-    def _start(self, keys: jax.Array, block: Block) -> _Cursor:
-        """A cursor of the right shape; its robots are placed before they step."""
+    def start(self, keys: jax.Array, block: Block) -> Cursor:
+        """A cursor for a block, with keys `[lanes]`; its robots are placed before they step."""
         yaw = jnp.zeros(keys.shape)
         first = jax.tree.map(lambda x: x[0], block["physics"])
         shapes = jax.eval_shape(self.robot.place, first, yaw)
         robots = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return devices.put(_Cursor(robots, yaw, yaw == 0, keys), self.mesh)
+        return devices.put(Cursor(robots, yaw, yaw == 0, keys), self.mesh)
 
-    def over(self, blocks: _Blocks, key: jax.Array, bar: Progress) -> list[tuple[np.ndarray, ...]]:
-        """Replays all blocks; where they follow one another, the robots go on."""
+    def over(self, blocks: Blocks, key: jax.Array, bar: Progress) -> list[tuple[np.ndarray, ...]]:
+        """Outputs of all blocks, on the host; where blocks follow one another, robots go on."""
         outputs: list[tuple[np.ndarray, ...]] = []
         cursor = None
         for i, block in enumerate(blocks):
@@ -275,16 +296,16 @@ class _Runner:
                 # A column's key is its own, however wide the blocks are.
                 columns = i * blocks.width + np.arange(blocks.width)
                 keys = jax.vmap(jax.random.fold_in, (None, 0))(key, columns)
-                cursor = self._start(keys, block)
-            cursor, out = self.program(cursor, self._put(block))
+                cursor = self.start(keys, block)
+            cursor, out = self.program(cursor, self.put(block))
             outputs.append(jax.tree.map(np.asarray, out))
             bar.advance(blocks.length * blocks.width)
         return outputs
 
-    def _replay(self, cursor: _Cursor, block: Block) -> tuple[_Cursor, tuple[jax.Array, ...]]:
+    def _replay(self, cursor: Cursor, block: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
         return jax.lax.scan(self._step, cursor, block)
 
-    def _step(self, cursor: _Cursor, row: Block) -> tuple[_Cursor, tuple[jax.Array, ...]]:
+    def _step(self, cursor: Cursor, row: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
         """One step of B lanes: placed on the record where it says so, then replayed."""
         placed = row["placed"]
         keys, yaw = _draw_yaw(cursor.keys)
@@ -296,7 +317,7 @@ class _Runner:
         after = self.robot.step(before, row["a"])
         valid = (placed | cursor.valid) & row["valid"] & ~after.diverged
         out = (before.observation, before.position, after.position, yaw, valid)
-        return _Cursor(after, yaw, valid, keys), out
+        return Cursor(after, yaw, valid, keys), out
 
 
 def _draw_yaw(keys: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -19,7 +19,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from genidm.errors import BadInput
-from genidm.store import disk, save_text
+from genidm.files import disk, save_text
 
 METRICS = "metrics.jsonl"
 # tensorboardX waits for the disk at each flush, so that happens every so many seconds.

@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import json
 import re
+import subprocess
 import sys
 import time
 
@@ -15,8 +16,12 @@ import numpy as np
 import pytest
 from point import Point
 
-from experiments import _sb3, benchmark
-from experiments.benchmark import ROWS, Bench, Options, Probe, Row
+from experiments.benchmark import __main__ as command
+from experiments.benchmark import collecting, comparing, fitting, sb3, starting, stepping
+from experiments.benchmark.bench import Bench, Options
+from experiments.benchmark.comparing import Row
+from experiments.benchmark.measuring import Probe, interleave, timed
+from experiments.benchmark.rows import ROWS, choose
 from genidm.errors import BadInput
 from genidm.methods import GE, LR
 from genidm.models import Architecture
@@ -27,8 +32,10 @@ KEYS = ["name", "value", "unit", "ratio_to", "ratio", "hardware"]
 @pytest.fixture
 def small(tmp_path, monkeypatch):
     """Sizes at which every row takes a moment."""
-    for name, size in {"SAMPLES": 600, "CHUNK": 1000, "UPDATES": 2, "STEPS": 3}.items():
-        monkeypatch.setattr(benchmark, name, size)
+    monkeypatch.setattr(stepping, "STEPS", 3)
+    monkeypatch.setattr(collecting, "CHUNK", 1000)
+    monkeypatch.setattr(fitting, "UPDATES", 2)
+    monkeypatch.setattr(fitting, "SAMPLES", 600)
     return Options(
         out=tmp_path / "out" / "benchmark.json", seconds=1e-3, lanes=8, wide=16, bank=(1, 20)
     )
@@ -46,10 +53,11 @@ def rows_of(values):
 
 def test_every_row_on_a_point(small, monkeypatch, capsys):
     numbers = {"seconds": 8.0, "wall": 9.0, "programs": 3.0}
-    monkeypatch.setattr(Bench, "starts", (numbers, dict.fromkeys(numbers, 0.5)))
+    both = numbers, dict.fromkeys(numbers, 0.5)
+    monkeypatch.setattr(starting, "starts", lambda bench: both)
     # Neither torch nor Stable-Baselines3 needs to be there, so here they never are.
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    results = benchmark.benchmark(Point(), small)
+    results = command.benchmark(Point(), small)
     assert json.loads(small.out.read_text()) == results
     assert all(list(r) == KEYS for r in results)
     assert all(r["value"] > 0 for r in results)
@@ -73,7 +81,7 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
 def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
     steps = []
 
-    class Pool(benchmark.Rollout):
+    class Pool(stepping.Rollout):
         def rollout(self, model, data, state, control):
             assert model is ant.mj_model
             states, sensors = super().rollout(model, data, state, control)
@@ -81,10 +89,10 @@ def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
             return states, sensors
 
     with contextlib.ExitStack() as exits, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "Rollout", Pool)
-        probe = benchmark.in_c(Bench(ant, small, exits))
+        patch.setattr(stepping, "Rollout", Pool)
+        probe = stepping.in_c(Bench(ant, small, exits))
         assert probe.sample(0.0) > 0
-    np.testing.assert_allclose(steps, benchmark.STEPS * ant.control_step)
+    np.testing.assert_allclose(steps, stepping.STEPS * ant.control_step)
     assert np.shape(steps) == (2, small.lanes)  # once to warm up, once timed
 
 
@@ -94,7 +102,7 @@ def test_products_are_those_of_the_networks(ant):
         networks = Architecture(size, settings.idm, settings.lfm, settings.latent_size)
         params = networks.init(jax.random.key(0), ant.observation.size)
         matrices = [x.shape for x in jax.tree.leaves(params) if x.ndim == 2]
-        psi, phi = benchmark._products(ant, settings)
+        psi, phi = fitting._products(ant, settings)
         assert sorted(psi + phi) == sorted(matrices)
 
 
@@ -104,7 +112,7 @@ def test_ratio_is_the_median_of_the_pairs(small):
     row = Row("row", "m/s", values("row"), ratio_to="base", rounds=3)
     with contextlib.ExitStack() as exits:
         bench = Bench(Point(), Options(seconds=60.0), exits)
-        first, second = benchmark.measure(bench, [base, row])
+        first, second = comparing.measure(bench, [base, row])
     assert (first["value"], second["value"], second["ratio"]) == (10.0, 30.0, 3.0)
     assert (first["ratio_to"], second["ratio_to"]) == (None, "base (as told)")
 
@@ -116,15 +124,15 @@ def test_rounds_go_to_and_fro_until_the_seconds_are_over():
         return Probe(lambda seconds: calls.append((name, seconds)) or float(len(calls)), "")
 
     both = [probe("a"), probe("b")]
-    np.testing.assert_array_equal(benchmark.interleave(both, 60.0, 3), [[1, 2], [4, 3], [5, 6]])
+    np.testing.assert_array_equal(interleave(both, 60.0, 3), [[1, 2], [4, 3], [5, 6]])
     assert [name for name, _ in calls] == list("abbaab")
     assert {seconds for _, seconds in calls} == {10.0}
-    assert benchmark.interleave(both, 1e-9, 3).shape == (1, 2)
+    assert interleave(both, 1e-9, 3).shape == (1, 2)
 
 
 def test_timed_counts_whole_calls():
     calls = []
-    sample = benchmark.timed(lambda: calls.append(0), 5.0)
+    sample = timed(lambda: calls.append(0), 5.0)
     assert len(calls) == 1  # compiled before it is timed
     began = time.perf_counter()
     rate, timed_calls = sample(1e-4), len(calls) - 1
@@ -132,13 +140,13 @@ def test_timed_counts_whole_calls():
 
 
 def test_choose_takes_what_a_row_is_compared_with():
-    names = [row.name for row in benchmark.choose(["two devices"])]
+    names = [row.name for row in choose(["two devices"])]
     assert names == ["raw MJX, one device", "raw MJX, two devices"]
     # A whole name is that row alone.
-    assert {row.name for row in benchmark.choose(["raw MJX"])} == {"MuJoCo in C", "raw MJX"}
-    assert benchmark.choose([]) == list(ROWS)
+    assert {row.name for row in choose(["raw MJX"])} == {"MuJoCo in C", "raw MJX"}
+    assert choose([]) == list(ROWS)
     with pytest.raises(BadInput, match=r"no row is called 'nothing'; there are: MuJoCo in C;"):
-        benchmark.choose(["nothing"])
+        choose(["nothing"])
 
 
 def test_rows_name_each_other():
@@ -154,7 +162,7 @@ def test_table():
         ("PPO (8 lanes)", 61.72, "steps/s", "raw (8 lanes)", 0.005),
     ]
     results = [dict(zip(KEYS, (*row, "a machine"), strict=True)) for row in rows]
-    assert benchmark.table(results).splitlines() == [
+    assert comparing.table(results).splitlines() == [
         "row             value  unit     ratio  to",
         "─" * 42,
         "raw (8 lanes)  12,346  steps/s",
@@ -163,7 +171,7 @@ def test_table():
 
 
 def test_compiling_counts():
-    with benchmark.compiling() as counted:
+    with starting.compiling() as counted:
         jax.jit(lambda x: jnp.sin(x) + 41)(1.0)
     assert 0 < counted["seconds"] < counted["wall"]
 
@@ -180,12 +188,17 @@ def test_compiling_counts():
 )
 def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
-    monkeypatch.setattr(benchmark, "Ant", Point)
-    monkeypatch.setattr(benchmark, "measure", None)  # not reached
+    monkeypatch.setattr(command, "Ant", Point)
+    monkeypatch.setattr(command, "measure", None)  # not reached
     with pytest.raises(SystemExit) as stop:
-        benchmark.main()
+        command.main()
     assert stop.value.code == 2
     assert said in capsys.readouterr().err
+
+
+def test_the_baseline_runs_without_jax():
+    code = f"import sys, {sb3.__name__}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_the_fastest_baseline_is_taken(monkeypatch):
@@ -201,10 +214,10 @@ def test_the_fastest_baseline_is_taken(monkeypatch):
         def rate(self, limit):
             return rates[self.environments]
 
-    monkeypatch.setattr(_sb3, "Baseline", Fake)
-    settings, said = _sb3.candidates(2), []
+    monkeypatch.setattr(sb3, "Baseline", Fake)
+    settings, said = sb3.candidates(2), []
     assert {n for n, _, _ in settings} == {1, 4, 8}
-    assert _sb3.fastest(settings, said.append)[0] == 4
+    assert sb3.fastest(settings, said.append)[0] == 4
     assert len(said) == len(settings) and said[-1] == "fake: too slow to wait for"
-    with pytest.raises(_sb3.Ended):
-        _sb3.fastest([(8, "", 1)], said.append)
+    with pytest.raises(sb3.Ended):
+        sb3.fastest([(8, "", 1)], said.append)

@@ -14,7 +14,7 @@ import pytest
 from killing import Killed, dies_at
 from point import Point, Straight
 
-from genidm import devices, stats, store
+from genidm import checkpoints, devices, stats
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.evaluate import Test, evaluate, flatten, run
@@ -166,7 +166,7 @@ def test_a_killed_test_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch, cor
     """With another number of devices it begins anew, as its queues belong to the devices."""
     robot, stage = Point(falls_at=4.0), Stage.open(tmp_path, "test", {})
     whole = steer(robot, lanes=8)
-    monkeypatch.setattr(store, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(checkpoints, "CHECKPOINT_SECONDS", 0)
     with monkeypatch.context() as m:
         m.setattr(Progress, "advance", dies_at(3))
         with pytest.raises(Killed):

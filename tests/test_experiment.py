@@ -28,13 +28,14 @@ import pytest
 from point import Point
 
 from genidm import collect as collecting
-from genidm import controller, experiment, methods, stats, store
+from genidm import controller, experiment, methods, stats
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.evaluate import Test
 from genidm.experiment import Options, Scale, cell, run_cell, scale_of
+from genidm.files import load_arrays, save_arrays
 from genidm.generalize import Generalize
 from genidm.methods import Method, literal
 from genidm.progress import Progress
@@ -174,7 +175,7 @@ def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:
 
 def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> None:
     stage = next(finished.out.glob("point/test-LR-0-*"))
-    tree, _ = store.load_arrays(stage / "episodes")
+    tree, _ = load_arrays(stage / "episodes")
     summary = stats.summary(Episodes(**tree["episodes"]))
     row = finished.results["methods"]["LR"]
     for name in ("mean", "std", "iqm", "fell", "ci95"):
@@ -327,9 +328,9 @@ def forget(out: Path, *names: str) -> None:
 def test_nan_in_the_experience_is_refused(copy: Path, capsys) -> None:
     forget(copy, "test-LR", "LR", "replay")
     chunk = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000"
-    tree, meta = store.load_arrays(chunk)
+    tree, meta = load_arrays(chunk)
     tree["o"][3, 2, 1] = np.nan
-    store.save_arrays(chunk, tree, meta, overwrite=True)
+    save_arrays(chunk, tree, meta, overwrite=True)
     refused(copy, capsys, "o holds NaN")
 
 
@@ -360,13 +361,13 @@ def test_the_experience_of_another_robot_is_refused(copy: Path, capsys) -> None:
     """Of its state, or, where that has as many numbers, of its physics."""
     forget(copy, "test-LR", "LR", "replay")
     chunk = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000"
-    tree, meta = store.load_arrays(chunk)
+    tree, meta = load_arrays(chunk)
     wheels = {**tree, "physics": {"wheels": tree["s"]}}
-    store.save_arrays(chunk, wheels, meta, overwrite=True)
+    save_arrays(chunk, wheels, meta, overwrite=True)
     refused(copy, capsys, "physics of another robot than point")
-    store.save_arrays(chunk, {**tree, "s": tree["s"][..., 1:]}, meta, overwrite=True)
+    save_arrays(chunk, {**tree, "s": tree["s"][..., 1:]}, meta, overwrite=True)
     refused(copy, capsys, "s has shape")
-    store.save_arrays(chunk, {"x": tree["s"]}, meta, overwrite=True)
+    save_arrays(chunk, {"x": tree["s"]}, meta, overwrite=True)
     refused(copy, capsys, "holds no experience")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from point import Point
 
-from genidm import controller, store, symmetry
+from genidm import checkpoints, controller, files, symmetry
 from genidm.controller import Controller, in_frame
 from genidm.errors import BadInput
 from genidm.fit import Fit, draw_plain, draw_siamese, fit, loss_plain, loss_siamese
@@ -234,7 +234,7 @@ class Killed(BaseException):
 
 
 def test_a_killed_fit_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(store, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(checkpoints, "CHECKPOINT_SECONDS", 0)
     run = functools.partial(fit, ROBOT, linear(64), jax.random.key(0), SMALL, chunk=10, quiet=True)
     whole, stage = run(), Stage.open(tmp_path, "fit", {})
     advance, calls = Progress.advance, []
@@ -289,7 +289,7 @@ def test_a_torn_controller_is_refused(tmp_path: Path) -> None:
 
 
 def test_what_is_no_controller_is_refused(tmp_path: Path) -> None:
-    store.save_arrays(tmp_path / "arrays", {"s": np.zeros(3)}, {})
+    files.save_arrays(tmp_path / "arrays", {"s": np.zeros(3)}, {})
     with pytest.raises(BadInput, match="holds no controller"):
         controller.load(tmp_path / "arrays", ROBOT)
 

@@ -17,8 +17,10 @@ PACKAGE = Path(genidm.__file__).parent
 ORDER = """
 errors episodes symmetry devices quiet
 genidm
+config
+files
+checkpoints progress
 store
-progress
 robots.base
 robots.mjx
 robots.*

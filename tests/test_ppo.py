@@ -18,7 +18,7 @@ from killing import Killed, dies_at
 from point import Point
 
 from genidm import collect as collecting
-from genidm import devices, store
+from genidm import devices
 from genidm.agents import ppo
 from genidm.agents.base import Iterate, Learning
 from genidm.agents.ppo import PPO
@@ -26,6 +26,7 @@ from genidm.agents.random import RandomActions
 from genidm.collect import collect
 from genidm.errors import BadInput
 from genidm.experience import Experience, load_chunks
+from genidm.files import Torn
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.store import Stage
 from genidm.tasks import Step, WalkForward, split
@@ -362,7 +363,7 @@ def test_a_torn_record_is_not_gone_on_from(killed) -> None:
     stage = killed(3)
     file = stage.path("experience") / "chunk_00000" / "a.npy"
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(store.Torn, match="cut short"):
+    with pytest.raises(Torn, match="cut short"):
         gather(stage=stage)
 
 

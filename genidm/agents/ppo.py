@@ -90,13 +90,13 @@ class PPO:
 
     lanes: int = 128
     unroll: int = 16
-    epochs: int = 7
-    minibatches: int = 8
+    epochs: int = 4
+    minibatches: int = 4
     learning_rate: float = 5e-4
-    discount: float = 0.98
+    discount: float = 0.99
     gae: float = 0.95
     clip: float = 0.2
-    entropy: float = 5e-3
+    entropy: float = 1e-3
     reward_scale: float = 0.1
     hidden: tuple[int, ...] = (64, 64)
     value_hidden: tuple[int, ...] = (64, 64)
@@ -132,8 +132,7 @@ class PPO:
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
         )
-        walk = functools.partial(_walk, robot, task, networks, self.unroll)
-        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
+        stepping = self.stepping(robot, task, mesh)
         learn = functools.partial(self._learn, networks, optimizer)
 
         def start(key: jax.Array) -> Learner:
@@ -154,25 +153,33 @@ class PPO:
         def place(learner: Learner) -> Learner:
             return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.mind, mesh))
 
-        def policy(mind: Mind) -> tuple[RunningStatisticsState, Any]:
-            return devices.put((mind.statistics, mind.params.policy), mesh, None)
-
         def prepare(learner: Learner) -> Iterate:
-            args = (*policy(learner.mind), learner.lanes)
-            step = compiled("PPO's stepping", jax.jit(sharded, donate_argnums=2), *args)
-            batch = jax.eval_shape(sharded, *args)[2]
+            args = (*acting(learner.mind, mesh), learner.lanes)
+            step = compiled("PPO's stepping", stepping, *args)
+            batch = jax.eval_shape(stepping, *args)[2]
             update = compiled(
                 "PPO's learning", jax.jit(learn, donate_argnums=0), learner.mind, batch
             )
 
             def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, batch, seen = step(*policy(learner.mind), learner.lanes)
+                lanes, experience, batch, seen = step(*acting(learner.mind, mesh), learner.lanes)
                 mind, losses = update(learner.mind, devices.gather(batch, mesh))
                 return Learner(lanes, mind), experience, seen | losses
 
             return iterate
 
         return Learning(start, place, prepare)
+
+    def stepping(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Any:
+        """The first program of an iteration: every device steps its own lanes.
+
+        Returns:
+          the jitted (*acting(mind, mesh), lanes `[B]`) → (lanes, Experience, Transition,
+          metrics), all but the lanes `[unroll, B, ...]`; it donates the lanes.
+        """
+        walk = functools.partial(_walk, robot, task, self.networks(robot), self.unroll)
+        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
+        return jax.jit(sharded, donate_argnums=2)
 
     def _learn(
         self,
@@ -219,6 +226,11 @@ def _statistics(size: int) -> RunningStatisticsState:
     """Of no states yet; of strong types, as those from a checkpoint: one program serves both."""
     state = running_statistics.init_state(jnp.zeros(size))
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
+
+
+def acting(mind: Mind, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
+    """What of a mind chooses actions: statistics and policy, a copy on every device."""
+    return devices.put((mind.statistics, mind.params.policy), mesh, None)
 
 
 def _walk(

@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from genidm import stats, store, symmetry
+from genidm import files, stats, symmetry
+from genidm.config import environment, plain
 from genidm.episodes import Episodes
 from genidm.evaluate import Test
 from genidm.methods import ORDER
@@ -31,7 +32,7 @@ class Tested:
 
     def load(self) -> tuple[Episodes, list[np.ndarray]]:
         """The outcome, and the ways of the tours (Fig. 8)."""
-        tree, _ = store.load_arrays(self.directory / "episodes")
+        tree, _ = files.load_arrays(self.directory / "episodes")
         ways = tree.get("ways", {})
         return Episodes(**tree["episodes"]), [ways[str(i)] for i in range(len(ways))]
 
@@ -40,8 +41,8 @@ def tests(root: Path, scale: str, settings: Test) -> Iterator[Tested]:
     """All finished tests of a robot at a scale, oldest first."""
     done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
     for path in done:
-        summary = store.load_json(path)
-        if summary["scale"] == scale and summary["test"] == store.plain(settings):
+        summary = files.load_json(path)
+        if summary["scale"] == scale and summary["test"] == plain(settings):
             yield Tested(path.parent, summary)
 
 
@@ -73,7 +74,7 @@ def report(
     material = Material(robot, root, bank, found, [_row(*item) for item in found.items()])
     written = table.results(
         material.rows, robot=robot.name, scale=scale, scenarios=bank.digest(),
-        environment=store.environment(),
+        environment=environment(),
     )  # fmt: skip
     here = root / f"report-{scale}"
     _write(here, "", "results.json", material, written)
@@ -141,15 +142,15 @@ def _write(
     paper = TABLE1.get(material.robot.name, {})
     closest = {row.method: stats.masked(row.episodes) for row in material.rows}
     heading, bearing = _angles(material.robot, material.bank)
-    store.save_json(directory / name, written)
-    store.save_text(directory / f"{prefix}table.md", table.markdown(written))
+    files.save_json(directory / name, written)
+    files.save_text(directory / f"{prefix}table.md", table.markdown(written))
     figures.violins(material.rows, directory / f"{prefix}violins.png", paper)
     figures.paths(_panels(material), directory / f"{prefix}paths.png")
     figures.bearings(closest, bearing, heading, directory / f"{prefix}bearings.png")
     _curves(directory, prefix, material)
     names = sorted(p.name for p in directory.glob(f"{prefix}*.png"))
     text = f"{table.text(written)}\n\nFigures in {directory}: {', '.join(names)}\n"
-    store.save_text(directory / f"{prefix}table.txt", text)
+    files.save_text(directory / f"{prefix}table.txt", text)
 
 
 def _panels(material: Material) -> list[figures.Panel]:
@@ -186,7 +187,7 @@ def _curves(directory: Path, prefix: str, material: Material) -> None:
         agents[f"{agent}, seed {seed}"] = _metrics(done.parent)
     for done in sorted(material.root.glob("replay-*/done.json")):
         mode = done.parent.name.split("-")[1]
-        modes[mode] = store.load_arrays(done.parent / "residual")[0]
+        modes[mode] = files.load_arrays(done.parent / "residual")[0]
     fits = {
         name: _metrics(material.root / seeds[0].summary["fit"])
         for name, seeds in material.found.items()

@@ -1,6 +1,6 @@
 """PPO of Stable-Baselines3 on gymnasium's Ant-v5: what `experiments.benchmark` compares with.
 
-    python -m experiments._sb3 --environments 4 --vector DummyVecEnv --threads 1
+    python -m experiments.benchmark.sb3 --environments 4 --vector DummyVecEnv --threads 1
 
 It runs in a process of its own, as torch and jax would fight for the cores: there `main`
 answers each line on stdin with one iteration, and `Baseline` is the other end of the pipe.
@@ -68,7 +68,7 @@ class Baseline(contextlib.AbstractContextManager):
         values = {"environments": environments, "vector": vector, "threads": threads}
         flags = [text for name, value in values.items() for text in (f"--{name}", str(value))]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "experiments._sb3", *flags],
+            [sys.executable, "-m", __name__, *flags],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.steps = self._answer()

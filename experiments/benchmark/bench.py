@@ -1,0 +1,96 @@
+"""What rows share: the robot, the sizes, and what is made once for several of them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.errors import BadInput
+from genidm.evaluate import Test
+from genidm.methods import RL
+from genidm.robots import Robot
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What is measured, and for how long.
+
+    Attributes:
+      out: where the rows are written, as JSON.
+      run: the finished fit stage whose controller is evaluated; an untrained one, unless
+        given. It decides how long episodes are, and with that the useful share.
+      rows: only the rows of these names, or of which these are a part, and those that they
+        are compared with; the file then holds no others.
+      seconds: of measuring, for each row.
+      lanes: robots at once in the rows of collecting.
+      wide: robots at once in the rows of 𝒢 and evaluation.
+      bank: test seeds, and episodes for each of them, of the useful share of evaluation.
+    """
+
+    out: Path = Path("experiments/results/benchmark.json")
+    run: Path | None = None
+    rows: tuple[str, ...] = ()
+    seconds: float = 60.0
+    lanes: int = RL.agent.lanes
+    wide: int = Test().lanes
+    bank: tuple[int, int] = (10, 1000)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.seconds < math.inf:
+            raise BadInput(f"seconds must be a number above 0, not {self.seconds}")
+        if min(self.lanes, self.wide, *self.bank) < 1:
+            raise BadInput("lanes, wide and both numbers of the bank must be at least 1")
+
+
+@dataclasses.dataclass
+class Bench:
+    """Where rows are measured.
+
+    Attributes:
+      robot: whose physics is stepped.
+      options: sizes.
+      exits: what is to be closed at the end.
+    """
+
+    robot: Robot
+    options: Options
+    exits: contextlib.ExitStack
+    _made: dict[Callable[[Bench], Any], Any] = dataclasses.field(default_factory=dict)
+
+    def once(self, make: Callable[[Bench], T]) -> T:
+        """What `make` makes of this bench, made when it is first asked for."""
+        if make not in self._made:
+            self._made[make] = make(self)
+        return self._made[make]
+
+    @functools.cached_property
+    def mesh(self) -> Mesh:
+        """All devices."""
+        return devices.mesh()
+
+    @functools.cached_property
+    def scratch(self) -> Path:
+        """A directory that is removed at the end."""
+        return Path(self.exits.enter_context(tempfile.TemporaryDirectory(prefix="genidm-")))
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def counted(n: int, what: str) -> str:
+    """A number of things, in words: "1 lane", "8 lanes"."""
+    return f"{n} {what}{'s' if n > 1 else ''}"

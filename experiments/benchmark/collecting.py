@@ -1,0 +1,95 @@
+"""Collecting: agents that learn and are recorded, and the record's way to the disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import jax
+import numpy as np
+
+from experiments.benchmark.bench import Bench, counted
+from experiments.benchmark.measuring import Probe, carried, timed
+from genidm.agents import ppo
+from genidm.agents.base import Agent, Iterate, Learning
+from genidm.collect import CHUNK, collect
+from genidm.experience import Experience, concatenate
+from genidm.methods import LR, RL, RS, Method
+
+
+def record(bench: Bench) -> Experience:
+    """Random actions, long enough for four blocks of 𝒢."""
+    assert LR.generalize
+    interactions = 4 * bench.options.wide * LR.generalize.segment
+    return collect(bench.robot, _agent(bench, RS), interactions, mesh=bench.mesh, quiet=True)[0]
+
+
+def collecting(bench: Bench, *, method: Method) -> Probe:
+    """What `collect` does: iterations of the agent, its metrics read, its record kept."""
+    agent = _agent(bench, method)
+    learning, learner = _started(bench, method, agent)
+    return _iterating(agent, learning.prepare(learner), learner, lambda part: concatenate([part]))
+
+
+def unrecorded(bench: Bench) -> Probe:
+    """The same with PPO, its record dropped before the program is compiled."""
+    agent = _agent(bench, RL)
+    learning, learner = _started(bench, RL, agent)
+    with mock.patch.object(ppo, "record", return_value=()):
+        iterate = learning.prepare(learner)
+
+    def keep(part: Any) -> None:
+        assert not jax.tree.leaves(part)
+
+    return _iterating(agent, iterate, learner, keep)
+
+
+def walking(bench: Bench) -> Probe:
+    """PPO's stepping alone: the policy is asked, all is recorded, nothing is learned."""
+    agent = _agent(bench, RL)
+    assert isinstance(agent, ppo.PPO)
+    _, learner = _started(bench, RL, agent)
+    policy = ppo.acting(learner.mind, bench.mesh)
+    program = agent.stepping(bench.robot, RL.task, bench.mesh)
+    return _steps(agent, lambda lanes: program(*policy, lanes)[0], learner.lanes)
+
+
+def writing(bench: Bench) -> Probe:
+    """Writing the record to the disk, as `collect` does now and then."""
+    part = bench.once(record)
+    chunk = concatenate([part] * -(-CHUNK // part.interactions))
+    call = functools.partial(chunk.save, bench.scratch / "chunk")
+    return Probe(timed(call, chunk.interactions), f"{chunk.interactions} steps at a time")
+
+
+def _agent(bench: Bench, method: Method) -> Any:
+    return dataclasses.replace(method.agent, lanes=bench.options.lanes)
+
+
+def _started(bench: Bench, method: Method, agent: Agent) -> tuple[Learning, Any]:
+    """The agent at work on the method's task, and its learner at the start."""
+    learning = agent.learning(bench.robot, method.task, bench.mesh)
+    return learning, learning.place(jax.jit(learning.start)(jax.random.key(0)))
+
+
+def _iterating(
+    agent: Agent, iterate: Iterate, learner: Any, keep: Callable[[Experience], object]
+) -> Probe:
+    """Iterations that go on from the learner; `keep` takes what each has recorded."""
+
+    def step(learner: Any) -> Any:
+        learner, part, metrics = iterate(learner)
+        keep(part)
+        jax.tree.map(np.mean, metrics)
+        return learner
+
+    return _steps(agent, step, learner)
+
+
+def _steps(agent: Agent, iteration: Callable[[Any], Any], start: Any) -> Probe:
+    """Steps/s over all lanes of what does an iteration's steps in a call."""
+    call = carried(iteration, start)
+    return Probe(timed(call, agent.lanes * agent.unroll), counted(agent.lanes, "lane"))

@@ -1,0 +1,38 @@
+"""𝒢: the record replayed, by itself and with its way to the devices and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+
+from experiments.benchmark.bench import Bench, counted
+from experiments.benchmark.collecting import record
+from experiments.benchmark.measuring import Probe, carried, timed
+from genidm.generalize import Blocks, Runner
+from genidm.methods import LR
+from genidm.progress import Progress
+
+
+def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
+    """What `replay` does: blocks sent to the devices, replayed and brought back.
+
+    Args:
+      bench: sizes.
+      program_alone: leave out the sending and bringing back.
+    """
+    assert LR.generalize
+    settings = dataclasses.replace(LR.generalize, lanes=bench.options.wide)
+    blocks = Blocks(bench.once(record), settings, bench.mesh.size)
+    key = jax.random.key(0)
+    keys, block = blocks.example(key)
+    runner = Runner(bench.robot, bench.mesh, (keys, block))
+    note = counted(blocks.width, "lane")
+    if program_alone:
+        there = runner.put(block)
+        call = carried(lambda cursor: runner.program(cursor, there)[0], runner.start(keys, block))
+        return Probe(timed(call, blocks.length * blocks.width), note)
+    bar = Progress("generalize", 0, "steps", quiet=True)
+    replay = functools.partial(runner.over, blocks, key, bar)
+    return Probe(timed(lambda: blocks.gather(replay()), blocks.total), note)

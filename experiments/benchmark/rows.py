@@ -1,0 +1,83 @@
+"""All rows there are, and the choice among them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+
+from experiments.benchmark.collecting import collecting, unrecorded, walking, writing
+from experiments.benchmark.comparing import Row
+from experiments.benchmark.evaluating import evaluating, tested
+from experiments.benchmark.fitting import fitting, multiplying
+from experiments.benchmark.others import baseline
+from experiments.benchmark.replaying import generalizing
+from experiments.benchmark.starting import starting
+from experiments.benchmark.stepping import in_c, raw
+from genidm.errors import BadInput
+from genidm.methods import GE, LR, RL, RS
+
+_P = functools.partial  # one object a build: rows that share it share what it compiles
+_RAW = _P(raw)
+_PPO = _P(collecting, method=RL)
+
+
+def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
+    """The rows of one number that `start` prints."""
+    first, second = (_P(starting, second=second, what=what) for second in (False, True))
+    base = Row(f"first start, {name}", unit, first, rounds=1)
+    return base, Row(f"second start, {name}", unit, second, base.name, 1)
+
+
+ROWS: tuple[Row, ...] = (
+    Row("MuJoCo in C", "steps/s", in_c),
+    Row("raw MJX", "steps/s", _RAW, "MuJoCo in C"),
+    Row("raw MJX, wide", "steps/s", _P(raw, wide=True), "MuJoCo in C"),
+    Row("raw MJX, one device", "steps/s", _P(raw, count=1)),
+    Row("raw MJX, two devices", "steps/s", _P(raw, count=2), "raw MJX, one device"),
+    Row("raw MJX, all devices", "steps/s", _RAW, "raw MJX, one device"),
+    Row("collecting, random actions", "steps/s", _P(collecting, method=RS), "raw MJX"),
+    Row("collecting, PPO", "steps/s", _PPO, "raw MJX"),
+    Row("collecting, PPO's stepping alone", "steps/s", walking, "raw MJX"),
+    Row("PPO, record dropped", "steps/s", unrecorded),
+    Row("PPO, record kept", "steps/s", _PPO, "PPO, record dropped"),
+    Row("writing the record", "steps/s", writing, "collecting, PPO"),
+    Row("𝒢", "steps/s", _P(generalizing), "raw MJX, wide"),
+    Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), "raw MJX, wide"),
+    Row("evaluation", "lane-steps/s", evaluating, "raw MJX, wide"),
+    Row("evaluation, all", "lane-steps", _P(tested, useful=False), rounds=1),
+    Row("evaluation, useful", "lane-steps", _P(tested, useful=True), "evaluation, all", 1),
+    Row("fit of LR, products alone", "updates/s", _P(multiplying, settings=LR.fit)),
+    Row("fit of LR", "updates/s", _P(fitting, settings=LR.fit), "fit of LR, products alone"),
+    Row("fit of GE, products alone", "updates/s", _P(multiplying, settings=GE.fit)),
+    Row("fit of GE", "updates/s", _P(fitting, settings=GE.fit), "fit of GE, products alone"),
+    Row("PPO of Stable-Baselines3 on gymnasium's Ant-v5", "steps/s", baseline),
+    Row("PPO", "steps/s", _PPO, "PPO of Stable-Baselines3 on gymnasium's Ant-v5"),
+    *_starts("compiling", "seconds", "s"),
+    *_starts("all", "wall", "s"),
+    *_starts("compiled", "programs", "programs"),
+)
+
+
+def choose(texts: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Row]:
+    """The rows that are named, and those they are compared with.
+
+    Args:
+      texts: each is the name of a row, or a part of the names of several; none: all rows.
+      rows: those there are.
+
+    Raises:
+      BadInput: a text is in no name.
+    """
+    by_row = {row.name: row for row in rows}
+    wanted = {name for text in texts for name in _named(text, by_row)} or set(by_row)
+    while bases := {by_row[n].ratio_to for n in wanted} - wanted - {None}:
+        wanted |= {name for name in bases if name}
+    return [row for row in rows if row.name in wanted]
+
+
+def _named(text: str, names: Iterable[str]) -> list[str]:
+    exact = [name for name in names if name == text]
+    found = exact or [name for name in names if text.lower() in name.lower()]
+    if not found:
+        raise BadInput(f"no row is called {text!r}; there are: {'; '.join(names)}")
+    return found

@@ -1,0 +1,263 @@
+"""Files and directories on disk: whole, or not at all.
+
+Everything is written beside its final name and renamed into place once it is on the disk,
+so that a run killed at any moment leaves the old files or the new ones. Directories carry
+the size and crc32 of each file; one that does not match is torn, and is not used. Nothing
+is ever pickled. A full disk, or one that cannot be written, is BadInput everywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import json
+import os
+import re
+import shutil
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from genidm.config import plain
+from genidm.errors import BadInput
+
+MANIFEST = "manifest.json"
+_SCRATCH = ".genidm-tmp"
+
+
+class Torn(BadInput):
+    """Files that are missing, cut short or changed since they were written."""
+
+
+@contextlib.contextmanager
+def disk(path: Path | str) -> Iterator[None]:
+    """Says in a sentence, as BadInput, why `path` cannot be read or written."""
+    try:
+        yield
+    except BadInput:
+        raise
+    except Exception as error:
+        # tensorstore gives a ValueError, and numpy no errno after a short write.
+        full = re.search("No space left|quota exceeded|requested and .* written", str(error))
+        if full or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            raise BadInput(f"no space left on the disk that holds {path}") from error
+        if isinstance(error, OSError):
+            raise BadInput(f"cannot use {path}: {error.strerror or error}") from error
+        raise
+
+
+def _scratch(path: Path, use: str) -> Path:
+    """A free name beside `path`; what killed processes left there is removed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".*{_SCRATCH}"):
+        if not _alive(int(left.stem.rpartition(".")[2])):
+            _delete(left)
+    name = path.with_name(f".{path.name}.{use}.{os.getpid()}{_SCRATCH}")
+    _delete(name)
+    return name
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # signal 0 only asks
+    except OSError as error:
+        return error.errno != errno.ESRCH
+    return True
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Removes a directory, if it is there, so that a kill leaves no half of it under its name.
+
+    Raises:
+      OSError: it cannot be removed; `disk` around the call says so in a sentence.
+    """
+    if path.exists():
+        away = path.rename(_scratch(path, "old"))
+        _delete(away)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def save_text(path: Path | str, text: str) -> None:
+    """Writes a text file."""
+    path = Path(path)
+    with disk(path):
+        scratch = _scratch(path, "new")
+        try:
+            scratch.write_text(text, encoding="utf-8")
+            _sync(scratch)
+            os.replace(scratch, path)
+            _sync(path.parent)
+        finally:
+            _delete(scratch)
+
+
+def save_json(path: Path | str, obj: Any) -> None:
+    """Writes `plain(obj)`."""
+    save_text(path, json.dumps(plain(obj), indent=2) + "\n")
+
+
+def load_json(path: Path | str) -> Any:
+    """Reads JSON; raises Torn if the file is missing or is not JSON."""
+    with disk(path):
+        try:
+            return json.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise Torn(f"{path} is missing") from None
+        except ValueError:
+            raise Torn(f"{path} is torn: it is not JSON") from None
+
+
+@contextlib.contextmanager
+def building(path: Path) -> Iterator[Path]:
+    """A directory to fill, which then takes the place of `path`, with a manifest.
+
+    An error while it is filled leaves `path` as it was.
+
+    Raises:
+      BadInput: the disk is full, or `path` cannot be written.
+    """
+    with disk(path):
+        scratch = _scratch(path, "new")
+        try:
+            scratch.mkdir()
+            yield scratch
+            entries = sorted(scratch.rglob("*"))
+            for entry in entries:
+                _sync(entry)
+            files = {str(p.relative_to(scratch)): _measure(p) for p in entries if p.is_file()}
+            save_json(scratch / MANIFEST, files)
+            remove(path)
+            scratch.rename(path)
+            _sync(path.parent)
+        finally:
+            _delete(scratch)
+
+
+def _measure(file: Path) -> list[int]:
+    size = crc = 0
+    with file.open("rb") as f:
+        while block := f.read(1 << 20):
+            size, crc = size + len(block), zlib.crc32(block, crc)
+    return [size, crc]
+
+
+def verify(directory: Path | str) -> list[str]:
+    """The files of a complete directory; raises Torn if it is not."""
+    directory = Path(directory)
+    with disk(directory):
+        if not directory.exists():
+            raise Torn(f"{directory} is missing")
+        files: dict[str, list[int]] = load_json(directory / MANIFEST)
+        for name, measure in files.items():
+            if not (directory / name).is_file():
+                raise Torn(f"{directory} is torn: {name} is missing")
+            if _measure(directory / name) != measure:
+                raise Torn(f"{directory} is torn: {name} was cut short or changed")
+        return list(files)
+
+
+def _complete(directory: Path) -> bool:
+    try:
+        return bool(verify(directory))
+    except Torn:
+        return False
+
+
+def save_arrays(path: Path | str, tree: Any, meta: Any, overwrite: bool = False) -> None:
+    """Writes arrays as a directory of .npy files.
+
+    Args:
+      path: the directory; a torn one there is replaced.
+      tree: nested dicts of arrays; `{"a": {"b": x}}` becomes `a.b.npy`.
+      meta: what JSON can hold (see `plain`), kept beside them.
+      overwrite: replace a complete directory, too.
+
+    Raises:
+      BadInput: `path` is complete already, or a name or an array cannot be kept.
+    """
+    path, arrays = Path(path), {name: as_array(name, x) for name, x in _dotted(tree)}
+    if not overwrite and _complete(path):
+        raise BadInput(f"{path} is there already, and is not overwritten")
+    with disk(path):
+        if path.exists() and any(path.iterdir()) and not (path / MANIFEST).exists():
+            raise BadInput(f"{path} holds something else, and is not overwritten")
+    with building(path) as scratch:
+        for name, array in arrays.items():
+            np.save(scratch / f"{name}.npy", array, allow_pickle=False)
+        save_json(scratch / "meta.json", meta)
+
+
+def load_arrays(path: Path | str, mmap: bool = False) -> tuple[dict[str, Any], Any]:
+    """What `save_arrays` wrote: `(tree, meta)`.
+
+    Args:
+      path: the directory.
+      mmap: leave the arrays on the disk, read-only, and read what is looked at.
+
+    Raises:
+      Torn: a file is missing, cut short or changed.
+      BadInput: a file holds pickled objects.
+    """
+    path, tree = Path(path), dict[str, Any]()
+    for file in verify(path):
+        if not file.endswith(".npy"):
+            continue
+        *parents, name = file.removesuffix(".npy").split(".")
+        node: dict[str, Any] = functools.reduce(lambda d, k: d.setdefault(k, {}), parents, tree)
+        try:
+            node[name] = np.load(path / file, mmap_mode="r" if mmap else None, allow_pickle=False)
+        except ValueError as error:
+            raise BadInput(f"{path / file} cannot be read: {error}") from None
+    return tree, load_json(path / "meta.json")
+
+
+def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if not isinstance(key, str) or not re.fullmatch(r"[\w-]+", key):
+            raise BadInput(f"{key!r} cannot name an array: letters, digits, _ and - can")
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def as_array(name: str, x: Any) -> np.ndarray:
+    """`x` as NumPy's, of any shape and dtype that can be kept without pickle.
+
+    Args:
+      name: what an error calls it.
+      x: an array, or a number.
+
+    Raises:
+      BadInput: it holds objects, text or typed random keys.
+    """
+    if is_key(x):
+        raise BadInput(f"{name} holds typed random keys: keep jax.random.key_data of them")
+    array = np.asarray(x)
+    if array.dtype.kind not in "biufc":
+        raise BadInput(f"{name} cannot be kept without pickle: its dtype is {array.dtype}")
+    return array
+
+
+def is_key(x: Any) -> bool:
+    """Whether `x` is an array of typed random keys (`jax.random.key`)."""
+    return hasattr(x, "dtype") and jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -1,0 +1,161 @@
+"""What is on the disk is whole, or is known not to be."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from bits import flip, same, truncate
+
+from genidm import checkpoints, files
+from genidm.checkpoints import Checkpoints
+from genidm.errors import BadInput
+from genidm.files import Torn, load_arrays, save_arrays
+from genidm.store import Stage
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+# --- arrays ----------------------------------------------------------------------------
+
+TREE = {
+    "physics": {
+        "qpos": np.arange(12.0, dtype=np.float32).reshape(3, 4).T,
+        "empty": np.zeros((0, 2)),
+    },
+    "ends": np.array([True, False]),
+    "count": np.uint64(2**63),
+}
+
+
+@pytest.mark.parametrize("mmap", [False, True])
+def test_arrays_come_back_bit_by_bit(tmp_path: Path, mmap: bool) -> None:
+    save_arrays(tmp_path / "x", TREE, {"seed": 3, "robot": "ant"})
+    tree, meta = load_arrays(tmp_path / "x", mmap=mmap)
+    same(tree, TREE)
+    assert meta == {"seed": 3, "robot": "ant"}
+    assert isinstance(tree["physics"]["qpos"], np.memmap) == mmap
+
+
+NAMES = ["physics.qpos.npy", "meta.json", "manifest.json"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("harm", [flip, truncate, Path.unlink])
+def test_torn_arrays_are_recognised_and_replaced(tmp_path: Path, name: str, harm) -> None:
+    save_arrays(tmp_path / "x", TREE, {})
+    harm(tmp_path / "x" / name)
+    with pytest.raises(Torn, match=r"torn|missing"):
+        load_arrays(tmp_path / "x")
+    if name != "manifest.json" or harm is not Path.unlink:
+        save_arrays(tmp_path / "x", TREE, {"again": True})
+        assert load_arrays(tmp_path / "x")[1] == {"again": True}
+
+
+def test_missing_arrays_are_torn(tmp_path: Path) -> None:
+    with pytest.raises(Torn, match="missing"):
+        load_arrays(tmp_path / "nowhere")
+
+
+def test_complete_arrays_are_overwritten_only_when_told(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", TREE, 1)
+    with pytest.raises(BadInput, match="not overwritten"):
+        save_arrays(tmp_path / "x", TREE, 2)
+    assert load_arrays(tmp_path / "x")[1] == 1
+    save_arrays(tmp_path / "x", {"a": np.ones(1)}, 3, overwrite=True)
+    assert load_arrays(tmp_path / "x")[1] == 3
+    assert sorted(p.name for p in (tmp_path / "x").iterdir()) == ["a.npy", *sorted(NAMES[1:])]
+
+
+def test_a_directory_of_something_else_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(BadInput, match="something else"):
+        save_arrays(tmp_path, TREE, {}, overwrite=True)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize(
+    ("tree", "why"),
+    [
+        ({"x": np.array([{}], object)}, "pickle"),
+        ({"x": jax.eval_shape(lambda: 0)}, "pickle"),
+        ({"x": jax.random.key(0)}, "random keys"),
+        ({"../x": np.ones(1)}, "cannot name"),
+        ({"a.b": np.ones(1)}, "cannot name"),
+    ],
+)
+def test_what_cannot_be_kept_is_refused(tmp_path: Path, tree: dict, why: str) -> None:
+    with pytest.raises(BadInput, match=why):
+        save_arrays(tmp_path / "x", tree, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_pickle_is_not_loaded_even_with_a_true_manifest(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", {"a": np.ones(1)}, {})
+    file = tmp_path / "x" / "a.npy"
+    np.save(file, np.array([print], object), allow_pickle=True)
+    manifest = files.load_json(tmp_path / "x" / "manifest.json")
+    files.save_json(tmp_path / "x" / "manifest.json", {**manifest, "a.npy": files._measure(file)})
+    for mmap in (False, True):
+        with pytest.raises(BadInput, match="cannot be read"):
+            load_arrays(tmp_path / "x", mmap=mmap)
+
+
+# --- full disks ------------------------------------------------------------------------
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch) -> None:
+    save_arrays(tmp_path / "x", TREE, 1)
+    files.save_json(tmp_path / "y.json", 1)
+    Checkpoints(tmp_path / "z").save(1, {"a": np.ones(3)})
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(os, "fsync", full_disk)
+    for write in (
+        lambda: save_arrays(tmp_path / "x", TREE, 2, overwrite=True),
+        lambda: save_arrays(tmp_path / "new", TREE, 2),
+        lambda: files.save_json(tmp_path / "y.json", 2),
+        lambda: Checkpoints(tmp_path / "z").save(2, {"a": np.ones(3)}),
+    ):
+        with pytest.raises(BadInput, match="no space left on the disk that holds"):
+            write()
+    assert sorted(tmp_path.rglob("*")) == before
+    assert load_arrays(tmp_path / "x")[1] == files.load_json(tmp_path / "y.json") == 1
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError("12000 requested and 512 written"),  # numpy
+        ValueError("RESOURCE_EXHAUSTED: Failed to write to file 14: No space left on device"),
+    ],
+)
+def test_a_full_disk_without_errno_is_recognised(tmp_path: Path, monkeypatch, error) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(np, "save", fail)
+    monkeypatch.setattr(checkpoints, "_write", fail)
+    with pytest.raises(BadInput, match="no space left"):
+        save_arrays(tmp_path / "x", TREE, {})
+    with pytest.raises(BadInput, match="no space left"):
+        Checkpoints(tmp_path / "z").save(2, {"a": np.ones(3)})
+    assert not [p for p in tmp_path.rglob("*") if p.name != "z"]
+
+
+def test_a_place_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for write in (
+        lambda: Stage.open(tmp_path / "file", "collect", {}),
+        lambda: save_arrays(tmp_path / "file" / "x", TREE, {}),
+        lambda: save_arrays(tmp_path / "file", TREE, {}, overwrite=True),
+        lambda: files.save_json("/proc/nothing/x.json", {}),
+        lambda: Checkpoints(tmp_path / "file").save(0, {"a": np.ones(3)}),
+    ):
+        with pytest.raises(BadInput, match="cannot use"):
+            write()
