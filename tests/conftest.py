@@ -8,6 +8,8 @@ from collections.abc import Iterator
 # Read when genidm is imported, so set before it: two devices, for tests that compare
 # `devices.mesh(jax.devices()[:1])` with `devices.mesh()`.
 os.environ["GENIDM_DEVICES"] = "2"
+# Tests compile hundreds of small programs, and most of them again in every run.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 
 import jax
 import pytest

@@ -19,6 +19,7 @@ import optax
 import pytest
 from bits import flip, same, truncate
 from brax.training.acme import running_statistics
+from killing import Killed
 
 from genidm import devices, files
 from genidm.checkpoints import Checkpoints
@@ -169,10 +170,6 @@ def test_torn_checkpoints_give_way_to_the_one_before(tmp_path: Path, capfd) -> N
 def test_two_leaves_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="one name"):
         Checkpoints(tmp_path).save(1, {"a": {"b": np.ones(1)}, "a/b": np.ones(1)})
-
-
-class Killed(BaseException):
-    """Stands for kill -9: nothing is tidied up after it."""
 
 
 def test_killed_at_any_moment_old_or_new_is_there(tmp_path: Path, monkeypatch) -> None:
