@@ -100,7 +100,7 @@ class Options:
       seed: collecting seed: of the experience, the replay and the fit. The test's are fixed.
       out: where runs are kept. The same command again goes on where it was.
       literal: the paper's letter instead of our settings: h = 1, whole-episode replay,
-        λ = 0.25, constant learning rate.
+        λ = 0.25, mean latents, constant learning rate.
       episodes: test episodes a seed; as the scale says, unless given.
       results: also write the table and the figures to this directory, under the robot's name.
       test: the test (A.1.3).

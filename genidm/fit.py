@@ -38,6 +38,8 @@ class Fit:
       lfm: hidden layers of ψ (Table 2).
       latent_size: k; None fits an IDM alone.
       latent_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
+      averaged: φ is fitted to the mean of a pair's latents (Eq. 6); off, to each of them. The
+        mean hides what the two differ by, and in the test there is one latent alone.
     """
 
     updates: int = 20_000
@@ -48,6 +50,7 @@ class Fit:
     lfm: tuple[int, ...] = (256, 256)
     latent_size: int | None = None
     latent_weight: float = 0.25
+    averaged: bool = True
 
     def __post_init__(self) -> None:
         if not 0 < self.latent_weight < 1:
@@ -80,13 +83,14 @@ def loss_plain(model: Controller, batch: Pairs) -> tuple[jax.Array, dict[str, ja
 
 
 def loss_siamese(
-    model: Controller, batch: Pairs, latent_weight: float
+    model: Controller, batch: Pairs, latent_weight: float, averaged: bool
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees the mean latent (Eq. 6)."""
-    gamma, gamma_hat = model.latent(batch.s, batch.d)
-    latent = loss_latent(gamma, gamma_hat)
-    predicted = model.architecture.action(model.params, (gamma + gamma_hat) / 2)
-    action = loss_action(predicted, batch.a)
+    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees their mean latent, or each."""
+    latents = model.latent(batch.s, batch.d)
+    latent = loss_latent(latents[0], latents[1])
+    seen = latents.mean(0, keepdims=True) if averaged else latents
+    predicted = model.architecture.action(model.params, seen)
+    action = loss_action(predicted, jnp.broadcast_to(batch.a, predicted.shape))
     loss = latent_weight * latent + (1 - latent_weight) * action
     return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}
 
@@ -215,7 +219,9 @@ def _updates(settings: Fit) -> Any:
     siamese = settings.latent_size is not None
     draw = draw_siamese if siamese else draw_plain
     loss = (
-        functools.partial(loss_siamese, latent_weight=settings.latent_weight)
+        functools.partial(
+            loss_siamese, latent_weight=settings.latent_weight, averaged=settings.averaged
+        )
         if siamese
         else loss_plain
     )

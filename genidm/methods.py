@@ -66,7 +66,9 @@ RL = Method(
 RS = dataclasses.replace(RL, name="RS", agent=RandomActions())
 GE = dataclasses.replace(RL, name="GE", share=0.5, generalize=Generalize())
 LR = dataclasses.replace(
-    GE, name="LR", fit=Fit(idm=(50, 50), lfm=(256, 256), latent_size=10, latent_weight=0.75)
+    GE,
+    name="LR",
+    fit=Fit(idm=(50, 50), lfm=(256, 256), latent_size=10, latent_weight=0.75, averaged=False),
 )
 HF = dataclasses.replace(RL, name="HF", mirror=True, frame="heading")
 
@@ -77,12 +79,13 @@ ORDER = ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR", "HF")
 def literal(method: Method) -> Method:
     """The method to the paper's letter.
 
-    h = 1, whole-episode replay (§5.2), λ = 0.25 and Adam at 1e-3 throughout (A.1.2).
+    h = 1, whole-episode replay (§5.2), λ = 0.25, φ fitted to mean latents (Eq. 6), and Adam
+    at 1e-3 throughout (A.1.2).
     """
     return dataclasses.replace(
         method,
         name=f"{method.name} literal",
         look_ahead=1,
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
-        fit=dataclasses.replace(method.fit, latent_weight=0.25, decay=False),
+        fit=dataclasses.replace(method.fit, latent_weight=0.25, averaged=True, decay=False),
     )

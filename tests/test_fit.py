@@ -63,8 +63,10 @@ def forward(params: dict, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def oracle(model: Controller, params: dict, batch: Pairs, weight: float) -> tuple[float, ...]:
-    """L, L1 and L2 (Eq. 5-7)."""
+def oracle(
+    model: Controller, params: dict, batch: Pairs, averaged: bool = True
+) -> tuple[float, ...]:
+    """L, L1 and L2 (Eq. 5-7); φ sees the mean of two latents, or each of them."""
     s, d, a, mean, std = (np.float64(x) for x in (batch.s, batch.d, batch.a, model.mean, model.std))
     x = np.concatenate([np.clip((s - mean) / std, -10, 10), d], axis=-1)
     first, second = [], []
@@ -74,27 +76,32 @@ def oracle(model: Controller, params: dict, batch: Pairs, weight: float) -> tupl
             continue
         gamma, gamma_hat = (forward(params["lfm"], x[view, n]) for view in (0, 1))
         first.append(np.sum((gamma - gamma_hat) ** 2))
-        mean_latent = (gamma + gamma_hat) / 2
-        second.append(np.sum((forward(params["idm"], mean_latent) - a[n]) ** 2))
+        for seen in [(gamma + gamma_hat) / 2] if averaged else [gamma, gamma_hat]:
+            second.append(np.sum((forward(params["idm"], seen) - a[n]) ** 2))
     latent, action = np.mean(first or [0.0]), np.mean(second)
-    return (weight * latent + (1 - weight) * action if first else action), latent, action
+    return (WEIGHT * latent + (1 - WEIGHT) * action if first else action), latent, action
 
 
-def losses(latent_size: int | None):
+def losses(latent_size: int | None, averaged: bool = True):
     if latent_size is None:
         return loss_plain
-    return functools.partial(loss_siamese, latent_weight=WEIGHT)
+    return functools.partial(loss_siamese, latent_weight=WEIGHT, averaged=averaged)
+
+
+KINDS = pytest.mark.parametrize(
+    ("latent_size", "averaged"), [(None, True), (K, True), (K, False)], ids=["IDM", "mean", "each"]
+)
 
 
 def doubled(params: dict) -> dict:
     return jax.tree.map(np.float64, params)
 
 
-@pytest.mark.parametrize("latent_size", [None, K])
-def test_the_losses_are_those_of_the_paper(latent_size: int | None) -> None:
+@KINDS
+def test_the_losses_are_those_of_the_paper(latent_size: int | None, averaged: bool) -> None:
     one, batch = model(latent_size), samples(views=2)
-    loss, info = jax.jit(losses(latent_size))(one, batch)
-    expected, latent, action = oracle(one, doubled(one.params), batch, WEIGHT)
+    loss, info = jax.jit(losses(latent_size, averaged))(one, batch)
+    expected, latent, action = oracle(one, doubled(one.params), batch, averaged)
     assert np.abs((batch.s - one.mean) / one.std).max() > 10  # the clip at 10 is in play
     assert loss == pytest.approx(expected, rel=1e-5) and info["loss"] == loss
     assert info["loss_action"] == pytest.approx(action, rel=1e-5)
@@ -103,18 +110,18 @@ def test_the_losses_are_those_of_the_paper(latent_size: int | None) -> None:
         assert latent > 0.1 and action > 0.1
 
 
-@pytest.mark.parametrize("latent_size", [None, K])
-def test_the_gradient_is_that_of_the_oracle(latent_size: int | None) -> None:
+@KINDS
+def test_the_gradient_is_that_of_the_oracle(latent_size: int | None, averaged: bool) -> None:
     """Along random directions, by central differences of the oracle in float64."""
     one, batch = model(latent_size), samples(views=2)
-    loss = losses(latent_size)
+    loss = losses(latent_size, averaged)
     grads = jax.jit(jax.grad(lambda p: loss(one.replace(params=p), batch)[0]))(one.params)
     rng = np.random.default_rng(3)
     for _ in range(5):
         way = jax.tree.map(lambda x: rng.normal(size=x.shape), one.params)
         at = [
             oracle(one, jax.tree.map(lambda p, w, e=e: p + e * w, doubled(one.params), way), batch,
-                   WEIGHT)[0]
+                   averaged)[0]
             for e in (-1e-6, 1e-6)
         ]  # fmt: skip
         slope = sum(np.sum(g * w) for g, w in zip(*map(jax.tree.leaves, (grads, way)), strict=True))
@@ -124,7 +131,7 @@ def test_the_gradient_is_that_of_the_oracle(latent_size: int | None) -> None:
 def test_the_latent_loss_vanishes_where_two_views_are_one() -> None:
     one, batch = model(K), samples(views=2)
     batch = batch.replace(s=batch.s[jnp.array([0, 0])], d=batch.d[jnp.array([0, 0])])
-    _, info = loss_siamese(one, batch, WEIGHT)
+    _, info = losses(K)(one, batch)
     assert info["loss_latent"] == 0
     assert float(info["loss"]) == pytest.approx(0.7 * float(info["loss_action"]), rel=1e-6)
 
