@@ -16,7 +16,7 @@ from genidm.experience import Experience, concatenate, load
 from genidm.progress import Progress
 from genidm.robots.base import Robot
 from genidm.store import Stage
-from genidm.tasks import WalkForward
+from genidm.tasks import Task, WalkForward
 
 # Transitions that are written to disk at a time.
 CHUNK = 1 << 17
@@ -28,36 +28,38 @@ def collect(
     interactions: int,
     seed: int = 0,
     *,
-    task: WalkForward | None = None,
+    task: Task | None = None,
     mesh: Mesh | None = None,
     stage: Stage | None = None,
+    keep: bool = True,
     quiet: bool = False,
-) -> tuple[Experience, Any]:
+) -> tuple[Any, Any]:
     """Lets an agent learn for a number of interactions, and keeps every one of them.
 
     Recording costs no interaction: what the agent learned from is what is kept, in order.
 
     Args:
       robot: what walks.
-      agent: PPO or RandomActions.
+      agent: what moves it, and learns.
       interactions: steps of one robot, counted over all lanes; rounded up to a whole
         iteration of the agent.
       seed: of everything random in here.
       task: what is rewarded; walking forward, unless given.
       mesh: devices to share the lanes among; all, unless given.
       stage: where the record, checkpoints and metrics go; they stay in memory, unless given.
+      keep: keep the record; off, the learner is all that is left.
       quiet: no progress bar.
 
     Returns:
-      the Experience `[T, lanes, ...]`, and the agent's learner as it ended.
+      the Experience `[T, lanes, ...]` (None unless kept), and the learner as it ended.
     """
     mesh = mesh or devices.mesh()
     _check(agent, interactions, mesh)
     learning = agent.learning(robot, task or WalkForward(), mesh)
     learner = learning.place(jax.jit(learning.start)(jax.random.key(seed)))
     size = agent.lanes * agent.unroll
-    iterations = -(-interactions // size)
-    log = _Log(robot, stage, max(1, CHUNK // size))
+    iterations = whole(agent, interactions) // size
+    log = _Log(robot, stage, max(1, CHUNK // size), keep)
     done, learner = log.resume(learner, learning)
     if done == iterations:
         return log.experience(), learner
@@ -67,10 +69,16 @@ def collect(
         for i in range(done, iterations):
             learner, part, metrics = iterate(learner)
             log.add(part)
+            bar.advance(size, **{name: np.mean(x) for name, x in metrics.items()})
             if log.full or i + 1 == iterations:
                 log.flush(i + 1, learner)
-            bar.advance(size, **{name: np.mean(x) for name, x in metrics.items()})
     return log.experience(), learner
+
+
+def whole(agent: Agent, interactions: int) -> int:
+    """Interactions, rounded up to a whole iteration of the agent: what `collect` makes."""
+    size = agent.lanes * agent.unroll
+    return -(-interactions // size) * size
 
 
 def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
@@ -81,27 +89,35 @@ def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
 
 
 class _Log:
-    """The record so far: on the devices until a chunk is full, then on disk if there is a stage."""
+    """The record so far: on the devices until a chunk is full, then on disk if there is a stage.
 
-    def __init__(self, robot: Robot, stage: Stage | None, chunk: int):
-        self.robot, self.stage, self.chunk = robot, stage, chunk
+    Unless it is to be kept, only the checkpoints are.
+    """
+
+    def __init__(self, robot: Robot, stage: Stage | None, chunk: int, keep: bool):
+        self.robot, self.stage, self.chunk, self.keep = robot, stage, chunk, keep
+        self.waiting = 0
         self.parts: list[Experience] = []
         self.chunks: list[Experience] = []
 
     @property
     def full(self) -> bool:
-        return len(self.parts) >= self.chunk
+        return self.waiting >= self.chunk
 
     def add(self, part: Experience) -> None:
-        self.parts.append(part)
+        self.waiting += 1
+        if self.keep:
+            self.parts.append(part)
 
     def flush(self, iteration: int, learner: Any) -> None:
         """Brings the parts to the host; with a stage, also to disk, and then a checkpoint."""
-        chunk = concatenate(self.parts)
-        self.parts = []
-        self.chunks.append(chunk)
+        self.waiting = 0
+        if self.keep:
+            self.chunks.append(concatenate(self.parts))
+            self.parts = []
+        if self.stage and self.keep:
+            self.chunks[-1].save(self._path(len(self.chunks) - 1))
         if self.stage:
-            chunk.save(self._path(len(self.chunks) - 1))
             state = {"learner": learner, "chunks": len(self.chunks)}
             self.stage.checkpoints().save(iteration, state)
 
@@ -118,5 +134,5 @@ class _Log:
         assert self.stage
         return self.stage.path("experience") / f"chunk_{chunk:05d}"
 
-    def experience(self) -> Experience:
-        return concatenate(self.chunks)
+    def experience(self) -> Experience | None:
+        return concatenate(self.chunks) if self.keep else None

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import files, symmetry
+from genidm.agents.policy import Policy
 from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.models import Architecture
@@ -90,12 +91,20 @@ class Controller(flax.struct.PyTreeNode):
         meta = {"robot": self.robot.name, "frame": self.frame} | plain(self.architecture)
         files.save_arrays(path, leaves, meta, overwrite)
 
+    @classmethod
+    def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Controller:
+        """The controller that `save` wrote, from what lies in its directory."""
+        architecture = Architecture(
+            meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
+        )
+        return cls(**tree, architecture=architecture, frame=meta["frame"], robot=robot)
 
-def load(path: Path, robot: Robot | None = None) -> Controller:
-    """A saved controller.
+
+def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
+    """A saved controller, fitted or learned.
 
     Args:
-      path: what `Controller.save` wrote.
+      path: what `Controller.save` or `Policy.save` wrote.
       robot: whose controller it is; found by its name, unless given.
 
     Raises:
@@ -107,10 +116,5 @@ def load(path: Path, robot: Robot | None = None) -> Controller:
     robot = robot or by_name(meta["robot"])
     if meta["robot"] != robot.name:
         raise BadInput(f"{path} holds a controller for {meta['robot']}, not for {robot.name}")
-    architecture = Architecture(
-        meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
-    )
-    return Controller(
-        params=tree["params"], mean=tree["mean"], std=tree["std"],
-        architecture=architecture, frame=meta["frame"], robot=robot,
-    )  # fmt: skip
+    restore = Policy.restore if "directed" in meta else Controller.restore
+    return restore(tree, meta, robot)

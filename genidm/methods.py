@@ -8,23 +8,46 @@ from __future__ import annotations
 
 import dataclasses
 
+from genidm.agents.ddpg import DDPG
+from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
+from genidm.agents.sac import SAC
 from genidm.controller import Frame
 from genidm.errors import BadInput
 from genidm.fit import Fit
 from genidm.generalize import Generalize
-from genidm.tasks import WalkForward
+from genidm.tasks import Dense, GoToGoal, Sparse, WalkForward
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A way from experience to a controller.
+    """A way to a controller.
 
     Attributes:
       name: as it stands in the table.
-      agent: what collects the experience.
+      agent: what collects the experience, or is itself the controller.
       task: what the agent is rewarded for meanwhile.
+    """
+
+    name: str
+    agent: PPO | SAC | DDPG | RandomActions
+    task: WalkForward | GoToGoal
+
+
+@dataclasses.dataclass(frozen=True)
+class Direct(Method):
+    """A baseline (§5.1): the agent learns to go to goals, and its policy is the controller."""
+
+    agent: PPO | SAC | DDPG
+    task: GoToGoal
+
+
+@dataclasses.dataclass(frozen=True)
+class Inverse(Method):
+    """From experience that was never goal-directed to a controller, by inverse dynamics (§4).
+
+    Attributes:
       share: the part of the record, from its start, that is learned from. The paper's GE
         and LR make the other half with 𝒢 (A.1.2).
       generalize: settings of 𝒢; None learns from the record alone.
@@ -35,9 +58,6 @@ class Method:
       fit: networks and losses.
     """
 
-    name: str
-    agent: PPO | RandomActions
-    task: WalkForward
     share: float
     generalize: Generalize | None
     look_ahead: int
@@ -52,7 +72,7 @@ class Method:
             raise BadInput(f"look_ahead must be at least 1, not {self.look_ahead}")
 
 
-RL = Method(
+RL = Inverse(
     name="RL",
     agent=PPO(),
     task=WalkForward(),
@@ -72,11 +92,33 @@ LR = dataclasses.replace(
 )
 HF = dataclasses.replace(RL, name="HF", mirror=True, frame="heading")
 
-ORDER = ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR", "HF")
+VGCP = Direct(name="VGCP", agent=PPO(), task=GoToGoal())
+HER_SP = Direct(name="HER_SP", agent=SAC(her=HER()), task=GoToGoal(reward=Sparse()))
+HER_DE = Direct(name="HER_DE", agent=DDPG(her=HER()), task=GoToGoal(reward=Dense()))
+
+TABLE1: tuple[Direct | Inverse, ...] = (RS, RL, VGCP, HER_SP, HER_DE, GE, LR)
+"""The methods of the paper's Table 1, top to bottom."""
+
+EXTRA: tuple[Direct | Inverse, ...] = (HF,)
+"""Methods that the paper does not have."""
+
+ORDER = tuple(method.name for method in (*TABLE1, *EXTRA))
 """Rows of the table, top to bottom; other names follow."""
 
 
-def literal(method: Method) -> Method:
+def by_name(name: str) -> Direct | Inverse:
+    """The method of that name.
+
+    Raises:
+      BadInput: there is none.
+    """
+    for method in (*TABLE1, *EXTRA):
+        if method.name == name:
+            return method
+    raise BadInput(f"no method is called {name!r}; there are: {', '.join(ORDER)}")
+
+
+def literal(method: Inverse) -> Inverse:
     """The method to the paper's letter.
 
     h = 1, whole-episode replay (§5.2), λ = 0.25, φ fitted to mean latents (Eq. 6), and Adam

@@ -12,6 +12,7 @@ import numpy as np
 
 from genidm.errors import BadInput
 from genidm.robots.base import Robot
+from genidm.tasks import ahead
 
 
 class Scenarios(flax.struct.PyTreeNode):
@@ -93,18 +94,9 @@ def toward(
       distance: `[seeds, episodes]`, metres from the start.
       bearing: `[seeds, episodes]`, radians to the left of the start's heading.
     """
-
-    def place(keys: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
-        state = robot.reset(keys, yaw)
-        return state.position, state.heading
-
-    flat = [x.reshape(-1) for x in (keys, yaw)]
-    position, heading = jax.jit(place)(*flat)
-    angle = heading.reshape(yaw.shape) + bearing
-    offset = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1) * distance[..., None]
-    level = position.reshape(*yaw.shape, 3)[..., :2] + offset
-    height = jnp.full((*yaw.shape, 1), robot.standing_height)
-    return Scenarios(keys, yaw, jnp.concatenate([level, height], axis=-1))
+    flat = [x.reshape(-1) for x in (keys, yaw, distance, bearing)]
+    target = ahead(robot, jax.jit(robot.reset)(*flat[:2]), *flat[2:])
+    return Scenarios(keys, yaw, target.reshape(*yaw.shape, 3))
 
 
 # Fig. 8: ten episodes where the robot starts as it did while it learned, and ten where it

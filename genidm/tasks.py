@@ -1,19 +1,22 @@
 """What a robot is rewarded for, and when its episode ends, over any Robot.
 
 Collecting rewards walking one way (A.1.1): forward velocity, a bonus for staying up,
-minus control and contact costs.
+minus control and contact costs. The baselines are rewarded for walking to a goal.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
+from genidm.errors import BadInput
 from genidm.robots.base import Robot, State, select
+from genidm.symmetry import horizontal
 
 
 class Lanes(flax.struct.PyTreeNode):
@@ -23,11 +26,33 @@ class Lanes(flax.struct.PyTreeNode):
       robots: their State.
       age: `[B]` int32, steps since the episode began.
       keys: `[B]`, one random stream a lane, so that results do not depend on sharding.
+      goal: `[B, 3]`, metres, world frame; None where the task has no goals.
     """
 
     robots: State
     age: jax.Array
     keys: jax.Array
+    goal: Any = None
+
+    @property
+    def displacement(self) -> Any:
+        """From the robots to their goals `[B, 3]`, metres; None where the task has none."""
+        return None if self.goal is None else self.goal - self.robots.position
+
+
+class Verdict(NamedTuple):
+    """What a task makes of a step, `[...]` each.
+
+    Attributes:
+      reward: of the step.
+      terminal: bool, the episode ends here for good.
+      rest: reward of each step for ever after a terminal one. A robot that has fallen is
+        not let off: what it would be charged if it lay there stands here.
+    """
+
+    reward: jax.Array
+    terminal: jax.Array
+    rest: jax.Array
 
 
 class Step(flax.struct.PyTreeNode):
@@ -37,19 +62,51 @@ class Step(flax.struct.PyTreeNode):
       before: State `[B]` that the action was chosen in.
       action: a `[B, A]`.
       after: State `[B]` that it led to.
+      goal: `[B, 3]`, metres, world frame; None where the task has no goals.
       reward: `[B]`.
-      first: `[B]` bool, `before` is the start of an episode.
-      terminal: `[B]` bool, the robot fell or its physics diverged.
+      rest: `[B]`, see `Verdict`.
+      age: `[B]` int32, steps of the episode before this one.
+      terminal: `[B]` bool, the robot fell, arrived, or its physics diverged.
       last: `[B]` bool, the episode ended here: terminal, or at the time limit.
     """
 
     before: State
     action: jax.Array
     after: State
+    goal: Any
     reward: jax.Array
-    first: jax.Array
+    rest: jax.Array
+    age: jax.Array
     terminal: jax.Array
     last: jax.Array
+
+    @property
+    def first(self) -> jax.Array:
+        """`[B]` bool, `before` is the start of an episode."""
+        return self.age == 0
+
+    def displacement(self, state: State) -> Any:
+        """From a state to the goal `[B, 3]`, metres; None where there is none."""
+        return None if self.goal is None else self.goal - state.position
+
+
+class Task(Protocol):
+    """What an agent learns: settings, as a frozen dataclass.
+
+    Attributes:
+      directed: whether there are goals.
+    """
+
+    directed: ClassVar[bool]
+
+    def start(self, robot: Robot, keys: jax.Array) -> Lanes:
+        """Lanes `[B]` at the start of fresh episodes."""
+
+    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
+        """One step of every lane under `[B, A]`; where an episode ended, a fresh one is drawn."""
+
+    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+        """What is worth a learning curve, `[B]` each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,48 +121,231 @@ class WalkForward:
 
     episode_steps: int = 1000
     start_yaw: float = 0.0
+    directed: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        _check_length(self.episode_steps)
 
     def start(self, robot: Robot, keys: jax.Array) -> Lanes:
-        """Lanes `[B]` at the start of fresh episodes."""
-        streams = jax.vmap(lambda k: jax.random.split(k, 3))(keys)
-        turn = jax.vmap(lambda k: jax.random.uniform(k, minval=-1.0, maxval=1.0))(streams[:, 0])
-        robots = robot.reset(streams[:, 1], self.start_yaw * turn)
-        return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams[:, 2])
-
-    def reward(self, robot: Robot, before: State, action: jax.Array, after: State) -> jax.Array:
-        """Reward `[B]` of one step."""
-        forward = (after.position[:, 0] - before.position[:, 0]) / robot.control_step
-        alive = robot.alive_bonus * ~(after.fallen | after.diverged)
-        return forward + alive - robot.cost(after, action)
+        robots, streams = _fresh(robot, keys, self.start_yaw)
+        return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams)
 
     def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
-        """One step of every lane; where an episode ended, a fresh one is drawn."""
-        before = lanes.robots
-        after = robot.step(before, action)
+        after = robot.step(lanes.robots, action)
+        forward = (after.position[:, 0] - lanes.robots.position[:, 0]) / robot.control_step
         terminal = after.fallen | after.diverged
-        last = terminal | (lanes.age + 1 >= self.episode_steps)
-        step = Step(
-            before=before,
-            action=action,
-            after=after,
-            reward=self.reward(robot, before, action, after),
-            first=lanes.age == 0,
-            terminal=terminal,
-            last=last,
-        )
-        going = Lanes(after, lanes.age + 1, lanes.keys)
-        return select(last, self.start(robot, lanes.keys), going), step
+        reward = forward + robot.alive_bonus * ~terminal - robot.cost(after, action)
+        verdict = Verdict(reward, terminal, jnp.zeros_like(reward))
+        return _go_on(self, robot, lanes, action, after, verdict, self.episode_steps)
+
+    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+        """Forward speed in m/s, reward, falls, divergences."""
+        forward = step.after.position[:, 0] - step.before.position[:, 0]
+        return {"speed": forward / robot.control_step} | _common(step)
 
 
-def metrics(robot: Robot, step: Step) -> dict[str, jax.Array]:
-    """What is worth a learning curve, `[B]` each: forward speed in m/s, reward, falls."""
-    forward = step.after.position[:, 0] - step.before.position[:, 0]
+class Approach(NamedTuple):
+    """A step towards a goal, as far as its reward depends on it, `[...]` each.
+
+    Attributes:
+      before: metres to the goal before the step, horizontally.
+      after: metres after it.
+      cost: control and contact costs.
+      fallen: bool.
+      reached: bool.
+    """
+
+    before: jax.Array
+    after: jax.Array
+    cost: jax.Array
+    fallen: jax.Array
+    reached: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Of VGCP: the robot "is encouraged to move in the direction of the goal" (A.1.1).
+
+    The walking reward, with the speed towards the goal in place of the forward speed. Who
+    has arrived stands there for ever, so that it is not better to keep away.
+    """
+
+    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
+        alive = robot.alive_bonus * ~step.fallen
+        speed = (step.before - step.after) / robot.control_step
+        return speed + alive - step.cost, alive
+
+
+@dataclasses.dataclass(frozen=True)
+class Sparse:
+    """Of HER-Sparse: "0 if it reaches the goal, and −1 otherwise" (A.1.1)."""
+
+    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
+        reward = jnp.where(step.reached, 0.0, -1.0)
+        return reward, reward
+
+
+@dataclasses.dataclass(frozen=True)
+class Dense:
+    """Of HER-Dense: "a weighted sum of distance to the goal and contact and control costs".
+
+    Attributes:
+      distance: weight of a metre.
+      cost: weight of the costs.
+    """
+
+    distance: float = 1.0
+    cost: float = 0.1
+
+    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
+        far = jnp.where(step.reached, 0.0, -self.distance * step.after)
+        return far - self.cost * step.cost, far
+
+
+@dataclasses.dataclass(frozen=True)
+class GoToGoal:
+    """Walk to a goal; start, heading and goal are drawn afresh for every episode.
+
+    Goals lie as in the paper's test (A.1.3): no baseline is asked for what it never saw.
+
+    Attributes:
+      reward: of a step.
+      episode_steps: the time limit.
+      start_yaw: radians; starts are turned by a yaw drawn from ± this.
+      bearing: radians; goals lie within ± this of the heading.
+      reach: metres; nearer is reached, and ends the episode.
+    """
+
+    reward: Progress | Sparse | Dense = Progress()
+    episode_steps: int = 300
+    start_yaw: float = math.pi
+    bearing: float = math.pi / 4
+    reach: float = 0.1
+    directed: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _check_length(self.episode_steps)
+        if self.reach <= 0:
+            raise BadInput(f"reach must be above 0, not {self.reach}")
+
+    def start(self, robot: Robot, keys: jax.Array) -> Lanes:
+        robots, streams = _fresh(robot, keys, self.start_yaw)
+        streams = jax.vmap(jax.random.split)(streams)
+        low, high = robot.target_distance
+
+        def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+            far, side = jax.random.split(key)
+            distance = jax.random.uniform(far, minval=low, maxval=high)
+            return distance, jax.random.uniform(side, minval=-self.bearing, maxval=self.bearing)
+
+        distance, bearing = jax.vmap(draw)(streams[:, 0])
+        goal = ahead(robot, robots, distance, bearing)
+        return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams[:, 1], goal)
+
+    def judge(
+        self,
+        robot: Robot,
+        o: jax.Array,
+        o_next: jax.Array,
+        goal: jax.Array,
+        cost: jax.Array,
+        fallen: jax.Array,
+    ) -> Verdict:
+        """What a step from `o` to `o_next` `[..., 3]` is worth on the way to `goal`.
+
+        A function of what a replay buffer holds, so that a relabelled step is judged as if
+        it had been made for its new goal.
+        """
+        after = horizontal(goal - o_next)
+        reached = after <= self.reach
+        step = Approach(horizontal(goal - o), after, cost, fallen, reached)
+        reward, rest = self.reward(robot, step)
+        return Verdict(reward, fallen | reached, rest)
+
+    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
+        before, after = lanes.robots, robot.step(lanes.robots, action)
+        verdict = self.judge(
+            robot, before.position, after.position, lanes.goal,
+            robot.cost(after, action), after.fallen | after.diverged,
+        )  # fmt: skip
+        return _go_on(self, robot, lanes, action, after, verdict, self.episode_steps)
+
+    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+        """Speed towards the goal in m/s, arrivals, reward, falls, divergences."""
+        before, after = (horizontal(step.goal - x.position) for x in (step.before, step.after))
+        speed = (before - after) / robot.control_step
+        return {"speed": speed, "reached": 1.0 * (after <= self.reach)} | _common(step)
+
+
+def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -> jax.Array:
+    """Targets `[B, 3]` at the height of a standing robot.
+
+    Args:
+      robot: gives the height.
+      state: of robots `[B]`, which the targets are seen from.
+      distance: `[B]`, metres, horizontal.
+      bearing: `[B]`, radians to the left of the heading.
+    """
+    angle = state.heading + bearing
+    offset = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1) * distance[:, None]
+    height = jnp.full_like(distance, robot.standing_height)
+    return jnp.concatenate([state.position[:, :2] + offset, height[:, None]], axis=-1)
+
+
+def _check_length(episode_steps: int) -> None:
+    if episode_steps < 1:
+        raise BadInput(f"episodes need at least 1 step, not {episode_steps}")
+
+
+def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.Array]:
+    """Fresh starts of B lanes, turned by up to ± `start_yaw`, and what is left of their keys."""
+    streams = jax.vmap(lambda k: jax.random.split(k, 3))(keys)
+    turn = jax.vmap(lambda k: jax.random.uniform(k, minval=-1.0, maxval=1.0))(streams[:, 0])
+    return robot.reset(streams[:, 1], start_yaw * turn), streams[:, 2]
+
+
+def _go_on(
+    task: Task, robot: Robot, lanes: Lanes, action: jax.Array, after: State, verdict: Verdict,
+    episode_steps: int,
+) -> tuple[Lanes, Step]:  # fmt: skip
+    """The lanes after a step: a fresh episode is drawn where one ended."""
+    last = verdict.terminal | (lanes.age + 1 >= episode_steps)
+    step = Step(
+        before=lanes.robots,
+        action=action,
+        after=after,
+        goal=lanes.goal,
+        reward=verdict.reward,
+        rest=verdict.rest,
+        age=lanes.age,
+        terminal=verdict.terminal,
+        last=last,
+    )
+    going = lanes.replace(robots=after, age=lanes.age + 1)
+    return select(last, task.start(robot, lanes.keys), going), step
+
+
+def _common(step: Step) -> dict[str, jax.Array]:
     return {
         "reward": step.reward,
-        "speed": forward / robot.control_step,
         "falls": 1.0 * step.after.fallen,
         "diverged": 1.0 * step.after.diverged,
     }
+
+
+def inputs(s: jax.Array, displacement: Any) -> jax.Array:
+    """What a policy is fed: s `[..., S]`, or (s, g − o) `[..., S + 3]` where there are goals."""
+    return s if displacement is None else jnp.concatenate([s, displacement], axis=-1)
+
+
+def input_size(robot: Robot, task: Task) -> int:
+    """Length of `inputs`."""
+    return robot.observation.size + 3 * task.directed
+
+
+def outlook(step: Verdict | Step, discount: float) -> jax.Array:
+    """Reward `[...]` of a step and, if it is terminal, of all that would follow it."""
+    return step.reward + step.terminal * step.rest * discount / (1 - discount)
 
 
 def split(lanes: Lanes) -> tuple[Lanes, Any]:

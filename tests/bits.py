@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,3 +29,18 @@ def same(a: object, b: object) -> None:
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         x, y = np.asarray(x), np.asarray(y)
         assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
+
+
+def leaves(tree: Any) -> list[np.ndarray]:
+    keys = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)
+    return [np.asarray(x) for x in jax.tree.leaves(keys)]
+
+
+def is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def close(a: Any, b: Any, atol: float) -> None:
+    """Same up to float sums."""
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=atol)

@@ -13,6 +13,7 @@ import importlib
 import itertools
 import json
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -25,42 +26,38 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from killing import Killed, dies_at
 from point import Point
+from tiny import TEST, tiny
 
+from experiments import evaluate, walk
+from genidm import cells, controller, experiment, methods, stats
 from genidm import collect as collecting
-from genidm import controller, experiment, methods, stats
-from genidm.agents.ppo import PPO
-from genidm.agents.random import RandomActions
+from genidm.agents.policy import Policy
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.evaluate import Test
-from genidm.experiment import Options, Scale, cell, run_cell, scale_of
+from genidm.experiment import Options, cell, run_cell
 from genidm.files import load_arrays, save_arrays
 from genidm.generalize import Generalize
-from genidm.methods import Method, literal
-from genidm.progress import Progress
+from genidm.methods import Inverse, Method, literal
+from genidm.progress import METRICS, Progress, read_metrics
+from genidm.robots import Ant
+from genidm.scale import Scale, scale_of
 from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import WalkForward
 
 
-def tiny(method: Method, **changes) -> Method:
-    agent = PPO(lanes=16, unroll=8, epochs=1, minibatches=2, hidden=(8,), value_hidden=(8,))
-    fit = dataclasses.replace(method.fit, updates=2500, batch=16, idm=(8,), lfm=(8,))
-    if method.fit.latent_size:
-        fit = dataclasses.replace(fit, latent_size=2)
-    fields = dict(
-        agent=agent if isinstance(method.agent, PPO) else RandomActions(lanes=16, unroll=8),
-        task=WalkForward(episode_steps=20),
-        generalize=method.generalize and Generalize(segment=6, lanes=32),
-        look_ahead=10,
-        fit=fit,
+def small(method: Inverse) -> Inverse:
+    """Tiny, with updates enough to be killed among."""
+    fit = dataclasses.replace(
+        tiny(method).fit, updates=2500, latent_size=method.fit.latent_size and 2
     )
-    return dataclasses.replace(method, **(fields | changes))
+    return tiny(method, look_ahead=10, fit=fit)
 
 
-RS, GE, LR = (tiny(m) for m in (methods.RS, methods.GE, methods.LR))
-TEST = Test(max_steps=40, lanes=16, chunk=10)
+RS, GE, LR = (small(m) for m in (methods.RS, methods.GE, methods.LR))
+VGCP, HER_SP = (tiny(m) for m in (methods.VGCP, methods.HER_SP))
 
 
 def options(out: Path, **changes) -> Options:
@@ -84,7 +81,7 @@ def counted() -> Iterator[Counter]:
 
     with pytest.MonkeyPatch.context() as m:
         for name in STAGES:
-            m.setattr(experiment, name, counting(name, getattr(experiment, name)))
+            m.setattr(cells, name, counting(name, getattr(cells, name)))
         yield calls
 
 
@@ -170,7 +167,7 @@ def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:
     assert (results["methods"]["RS"]["replayed"], lr["seeds"], lr["episodes"]) == (0, 10, 2)
     assert list(lr["success"]) == ["0.25", "0.5", "1.0"]
     assert lr["settings"]["fit"]["latent_size"] == 2 and lr["settings"]["look_ahead"] == 10
-    assert results["paired"].keys() == {"GE-RS", "LR-GE"}
+    assert results["paired"].keys() == {"GE-RS", "LR-GE", "LR-RS"}
 
 
 def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> None:
@@ -216,15 +213,15 @@ def test_one_change_runs_what_depends_on_it_again(
     made = {
         "collect": this.experience_stage.done,
         "replay": this.replay_stage.done,
-        "fit": this.fit_stage.done,
+        "fit": this.controller_stage.done,
     }
     assert {name for name, done in made.items() if not done} == again - {"run"}
 
 
 def test_another_seed_and_another_test_have_stages_of_their_own(copy: Path, monkeypatch) -> None:
     seed = cell(Point(), LR, options(copy, seed=1))
-    assert not (seed.experience_stage.done or seed.replay_stage.done or seed.fit_stage.done)
-    monkeypatch.setattr(experiment, "run", ran)
+    assert not (seed.experience_stage.done or seed.replay_stage.done or seed.controller_stage.done)
+    monkeypatch.setattr(cells, "run", ran)
     for changes in (dict(episodes=1), dict(test=dataclasses.replace(TEST, reach=0.2))):
         with counted() as calls, pytest.raises(Ran):
             run_cell(Point(), LR, options(copy, **changes))
@@ -242,11 +239,10 @@ def ran(*args, **kwargs):
 def test_the_literal_method_is_the_papers() -> None:
     this = cell(Point(), LR, Options(literal=True)).method
     assert this == literal(LR) and this.name == "LR literal" and this.look_ahead == 1
-    assert (this.generalize.mode, this.fit.latent_weight, this.fit.decay) == (
-        "episodes",
-        0.25,
-        False,
-    )
+    kept = (this.generalize.mode, this.fit.latent_weight, this.fit.averaged, this.fit.decay)
+    assert kept == ("episodes", 0.25, True, False)
+    with pytest.raises(BadInput, match="letter"):
+        cell(Point(), methods.VGCP, Options(literal=True))
 
 
 def test_scales_are_shares_of_the_paper() -> None:
@@ -262,6 +258,96 @@ def test_scales_are_shares_of_the_paper() -> None:
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
         with pytest.raises(BadInput, match="--scale"):
             scale_of(wrong, 2000)
+
+
+# ── a method that learns to go to goals itself ──────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def direct(tmp_path_factory) -> Finished:
+    out = tmp_path_factory.mktemp("direct")
+    with counted() as calls:
+        report = run_cell(Point(), VGCP, options(out))
+    return Finished(out, report, [calls])
+
+
+def test_a_policy_is_its_own_controller(direct: Finished) -> None:
+    assert direct.done == [Counter(collect=1, run=1)]
+    stages = {p.parent.name.rsplit("-", 1)[0] for p in direct.out.rglob("done.json")}
+    assert stages == {"VGCP-0", "test-VGCP-0"}
+    stage = Stage(stage_of(direct.out, "VGCP"))
+    policy = controller.load(stage.path("controller"), Point())
+    assert isinstance(policy, Policy) and policy.directed
+    assert not any(stage.path(x).exists() for x in ("experience", "checkpoints"))
+    lines = read_metrics(stage.path(METRICS))
+    assert lines[-1]["step"] == stage.summary()["learned_from"] == 1024
+    assert {"reward", "speed", "reached", "policy_loss"} <= lines[-1].keys()
+
+
+def test_its_row_stands_among_the_others(direct: Finished, copy: Path) -> None:
+    for stage in (direct.out / "point").glob("*VGCP-0-*"):
+        shutil.copytree(stage, copy / "point" / stage.name)
+    with counted() as calls:
+        report = run_cell(Point(), VGCP, options(copy))
+    assert not calls
+    results = json.loads((report / "results.json").read_text())["methods"]
+    assert list(results) == ["RS", "VGCP", "GE", "LR"]
+    row, alone = results["VGCP"], direct.results["methods"]["VGCP"]
+    assert {n: x for n, x in row.items() if n != "invariance"} == alone  # that needs a record
+    assert (row["interactions"], row["replayed"], row["seeds"], row["episodes"]) == (1024, 0, 10, 2)
+    assert row["settings"]["task"]["episode_steps"] == 20 and 0 < row["mean"] < 5
+
+
+def test_killed_on_its_way_it_ends_with_the_same_bits(
+    direct: Finished, tmp_path: Path, monkeypatch
+) -> None:
+    """While it learns, as its stage is to be marked done, and in the test."""
+    monkeypatch.setattr(collecting, "CHUNK", 2 * 128)
+    for owner, name, death in (
+        (Progress, "advance", dies_at(5)),
+        (Stage, "finish", dying),
+        (Progress, "advance", dying),
+    ):
+        with monkeypatch.context() as m:
+            m.setattr(owner, name, death)
+            with pytest.raises(Killed):
+                run_cell(Point(), VGCP, options(tmp_path))
+    with counted() as calls:
+        run_cell(Point(), VGCP, options(tmp_path))
+    assert calls == Counter(run=1)
+    for stage in ("VGCP", "test-VGCP"):
+        whole, killed = (arrays(stage_of(out, stage)) for out in (direct.out, tmp_path))
+        assert whole and whole == killed
+
+
+def dying(*args, **kwargs):
+    raise Killed
+
+
+def test_it_is_tested_again_like_any_controller(direct: Finished, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(controller, "by_name", lambda name: Point())
+    evaluate.main(stage_of(direct.out, "VGCP"), seeds=10, episodes=2, test=TEST)
+    mean = direct.results["methods"]["VGCP"]["mean"]
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("VGCP"))
+    assert f"{mean:.2f}" in row
+
+
+def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:
+    """Of the agents that learned; random actions leave no policy."""
+    monkeypatch.setattr(walk, "by_name", lambda name: {"point": Point()}[name])
+    walk.main(finished.out / "point", episodes=4)
+    (line,) = capsys.readouterr().out.splitlines()
+    name, speed = line.split(": ")
+    assert name == stage_of(finished.out, "experience-PPO").name
+    assert "m/s" in speed and -1 <= float(speed.split()[0]) <= 1
+
+
+@pytest.mark.parametrize("name", methods.ORDER)
+def test_every_method_has_a_command(name: str, monkeypatch) -> None:
+    asked: list = []
+    monkeypatch.setattr(experiment, "main", lambda *args: asked.append(args))
+    runpy.run_module(f"experiments.ant_{name.lower()}", run_name="__main__")
+    assert asked == [(Ant, getattr(methods, name))]
 
 
 # ── bad input: one sentence on stderr, exit status 2, nothing overwritten ───────────────
@@ -297,6 +383,7 @@ def refused(out: Path, capsys, why: str, *flags: str, **options) -> None:
         (("--method.fit.latent-size", "0"), "k (latent_size)"),
         (("--method.look-ahead", "0"), "look_ahead"),
         (("--method.share", "2"), "share"),
+        (("--method.agent.epochs", "0"), "epochs"),
         (("--episodes", "0"), "at least one"),
         (("--test.lanes", "0"), "lanes"),
     ],
@@ -306,6 +393,22 @@ def test_settings_that_cannot_be_are_refused(
 ) -> None:
     refused(tmp_path / "runs", capsys, why, *flags)
     assert not list(tmp_path.rglob("experience-*"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--method.agent.discount", "1"), "discount"),
+        (("--method.agent.her.goals", "0"), "at least 1 goal"),
+        (("--method.agent.capacity", "7"), "buffer"),
+        (("--method.task.reach", "0"), "reach"),
+    ],
+)
+def test_settings_that_no_learner_can_have_are_refused(
+    tmp_path: Path, capsys, flags: tuple, why: str
+) -> None:
+    refused(tmp_path / "runs", capsys, why, *flags, method=HER_SP)
+    assert not list(tmp_path.rglob("done.json"))
 
 
 def test_an_out_that_cannot_be_written_is_refused(tmp_path: Path, capsys) -> None:
@@ -420,11 +523,14 @@ def compare(whole: Path, killed: Path, scale: str) -> None:
         name = next(whole.glob(f"{stage}-0-*")).name
         a, b = arrays(whole / name), arrays(killed / name)
         assert a and a == b
-    a, b = (record(next(root.glob("experience-PPO-0-*"))) for root in (whole, killed))
-    assert a and a == b
+    experiences = [next(root.glob("experience-PPO-0-*")) for root in (whole, killed)]
+    for of in (record, lambda stage: arrays(stage / "policy")):
+        a, b = map(of, experiences)
+        assert a and a == b
     results = (root / f"report-{scale}" / "results.json" for root in (whole, killed))
     a, b = (json.loads(path.read_text())["methods"]["LR"] for path in results)
-    assert a == b
+    # The invariance is measured on any record that lies there, not on the method's own.
+    assert a | {"invariance": 0} == b | {"invariance": 0}
 
 
 def arrays(stage: Path) -> dict[str, bytes]:

@@ -27,7 +27,9 @@ robots.*
 robots
 tasks
 experience
-agents.base
+agents.policy agents.buffer
+agents.base agents.her
+agents.off_policy
 agents.*
 agents
 collect
@@ -37,12 +39,17 @@ controller
 fit
 scenarios
 evaluate
+invariance
 stats
 report.paper
-report.table
+report.rows
+report.table report.drawing
 report.figures
 report
-methods
+methods scale
+cells
+report.runs
+report.shown
 report.write
 experiment
 """

@@ -11,10 +11,10 @@ from matplotlib.image import imread
 
 from genidm import report, stats
 from genidm.episodes import Episodes
-from genidm.report import figures, table
+from genidm.report import drawing, figures, table
 
 METHODS = {"RS": 3.0, "RL": 2.0, "GE": 1.0, "LR": 0.6, "HF": 0.3}
-EXTRA = {"reached", "diverged", "steps"}
+EXTRA = {"reached", "diverged", "steps", "training_seed"}
 KEYS = {
     *("interactions", "replayed", "seeds", "episodes", "mean", "std", "ci95", "iqm"),
     *("success", "fell", "settings"),
@@ -38,16 +38,17 @@ def outcome(mean: float, rng: int = 0, seeds: int = 4, episodes: int = 50) -> Ep
     )
 
 
-def row(method: str, collections: int = 0) -> report.Row:
-    runs = tuple(outcome(METHODS.get(method, 1.5), rng) for rng in range(max(collections, 1)))
+def row(method: str, seeds: int = 1, **changes) -> report.Row:
+    runs = {seed: outcome(METHODS.get(method, 1.5), seed) for seed in range(seeds)}
     replayed = 1_000_000 if method in ("GE", "LR") else 0
     settings = {"latent_weight": np.float32(0.25), "hidden": (50, 50), "k": np.int64(10)}
-    return report.Row(method, runs[0], 2_000_000, replayed, settings, runs[:collections])
+    this = report.Row(method, runs[0], 2_000_000, replayed, settings, runs)
+    return dataclasses.replace(this, **changes)
 
 
 @pytest.fixture
 def rows() -> list[report.Row]:
-    return [row(name, 3 if name in ("GE", "LR") else 0) for name in METHODS]
+    return [row(name, 3 if name in ("GE", "LR") else 1) for name in METHODS]
 
 
 def document(rows, robot="ant"):
@@ -75,20 +76,106 @@ def test_results_are_the_episodes_numbers(rows):
     method, episodes = document(rows)["methods"]["GE"], rows[2].episodes
     assert method["mean"] == pytest.approx(episodes.closest.mean(), abs=1e-6)
     assert method["std"] == pytest.approx(episodes.closest.std(), abs=1e-6)
-    means = [e.closest.mean() for e in rows[2].collecting_seeds]
-    assert method["collecting_seeds"]["means"] == pytest.approx(means, abs=1e-6)
-    assert method["collecting_seeds"]["std"] == pytest.approx(np.std(means, ddof=1), abs=1e-6)
+    means = [e.closest.mean() for e in rows[2].collecting_seeds.values()]
+    over = method["collecting_seeds"]
+    assert (over["seeds"], over["episodes"]) == ([0, 1, 2], [[4, 50]] * 3)
+    assert over["means"] == pytest.approx(means, abs=1e-6)
+    assert over["std"] == pytest.approx(np.std(means, ddof=1), abs=1e-6)
+    assert over["ci95"] == pytest.approx([min(means), max(means)], abs=1e-6)
 
 
-def test_neighbours_are_paired(rows):
+def test_what_is_not_known_of_a_row_is_not_in_its_results():
+    known = document([row("LR", invariance=0.123456)])["methods"]["LR"]
+    assert (known["training_seed"], known["invariance"]) == (0, 0.123)
+    assert "collecting_seeds" not in known
+    unknown = document([row("LR", collecting_seeds={})])["methods"]["LR"]
+    assert not unknown.keys() & {"training_seed", "collecting_seeds", "invariance"}
+
+
+def test_neighbours_are_paired_and_the_papers_method_with_the_rest(rows):
     paired = document(rows)["paired"]
-    assert list(paired) == ["RL-RS", "GE-RL", "LR-GE", "HF-LR"]
+    assert list(paired) == ["RL-RS", "GE-RL", "LR-GE", "HF-LR", "LR-RS", "LR-RL"]
+    expected = stats.paired(rows[3].episodes, rows[0].episodes)
+    assert paired["LR-RS"]["difference"] == pytest.approx(expected["difference"], abs=1e-6)
+    assert paired["LR-RS"]["ci95"] == pytest.approx(expected["ci95"], abs=1e-6)
+    assert list(document(rows[::-1])["paired"]) == [
+        *("LR-HF", "GE-LR", "RL-GE", "RS-RL"),
+        *("LR-RL", "LR-RS"),
+    ]
+    assert list(document(rows[:3])["paired"]) == ["RL-RS", "GE-RL"]
     expected = stats.paired(rows[3].episodes, rows[2].episodes)
     assert paired["LR-GE"]["difference"] == pytest.approx(expected["difference"], abs=1e-6)
     assert paired["LR-GE"]["difference"] < 0
     assert len(paired["LR-GE"]["collecting_seeds"]["means"]) == 3
+    assert paired["LR-GE"]["collecting_seeds"]["seeds"] == [0, 1, 2]
+    assert paired["LR-GE"]["collecting_seeds"]["improvement"] == 1.0
     assert "collecting_seeds" not in paired["HF-LR"]
     assert document(rows[:1])["paired"] == {}
+
+
+def test_runs_are_paired_by_their_training_seed_on_what_both_saw():
+    lr, ge = {n: outcome(1.0, n) for n in (0, 1, 2)}, {n: outcome(1.5, n) for n in (0, 2, 3)}
+    ge[2] = outcome(1.5, 2, seeds=4, episodes=30)
+    lr[2] = dataclasses.replace(lr[2], closest=lr[2].closest + 1)
+    these = [row("GE", episodes=ge[0], collecting_seeds=ge)]
+    these.append(row("LR", episodes=lr[0], collecting_seeds=lr))
+    over = document(these)["paired"]["LR-GE"]["collecting_seeds"]
+    expected = [
+        (lr[0].closest - ge[0].closest).mean(),
+        (lr[2].closest[:, :30] - ge[2].closest).mean(),
+    ]
+    assert over["seeds"] == [0, 2]
+    assert over["means"] == pytest.approx(expected, abs=1e-6)
+    assert over["improvement"] == 0.5
+
+
+def compared(shown: str) -> list[str]:
+    """The pairs of methods that a table names, line by line."""
+    words = (line.strip("| ").split() for line in shown.splitlines())
+    names = [line[0] for line in words if line]
+    return [name for name in names if set(name.split("-")) <= METHODS.keys() and "-" in name]
+
+
+def test_each_pair_is_printed_once(rows):
+    r = document(rows)
+    for shown in (report.text(r), report.markdown(r)):
+        assert compared(shown) == list(r["paired"])
+    (line,) = [x for x in report.text(r).splitlines() if x.startswith("LR-GE")]
+    pair = r["paired"]["LR-GE"]
+    assert f"{pair['difference']:+.3f}" in line and line.endswith("3 of 3")
+    assert compared(report.text(document(rows[:1]))) == []
+
+
+def test_comparisons_have_no_columns_for_training_seeds_that_are_not_there():
+    r = document([row("RL"), row("LR")])
+    (line,) = [x for x in report.markdown(r).splitlines() if x.startswith("| LR-RL")]
+    assert line.count("|") == table.BRIEF + 1
+    assert "then over the training seeds" not in report.text(r)
+
+
+def test_half_a_training_seed_is_not_lost_in_rounding():
+    a = row("LR", 3, collecting_seeds={n: outcome(1.0, n) for n in range(3)})
+    means = {0: outcome(1.5, 0), 1: outcome(0.5, 1), 2: outcome(1.0, 2)}
+    r = document([row("GE", episodes=means[0], collecting_seeds=means), a])
+    (line,) = [x for x in report.text(r).splitlines() if x.startswith("LR-GE")]
+    assert line.endswith("1.5 of 3")
+
+
+def test_the_notes_tell_which_numbers_are_over_which_seeds(rows):
+    notes = report.text(document(rows)).replace("\n", " ")
+    assert "All but “over seeds” is of training seed 0" in notes
+    assert "“Over seeds” is of 3 training seeds" in notes
+    assert "tested on 4 × 50 episodes" in notes and "GE 0." in notes
+    only = report.text(document([row("LR")])).replace("\n", " ")
+    assert "“Over seeds” is of" not in only
+    other = row("GE", collecting_seeds={5: outcome(1.0)})
+    assert "one training seed (GE 5, LR 0)" in report.text(document([other, row("LR")]))
+
+
+def test_the_notes_hold_the_invariance():
+    r = document([row("LR", invariance=0.1234), row("HF", invariance=2.3e-6), row("x")])
+    assert "LR 0.12, HF 2.3e-06." in report.text(r).replace("\n", " ")
+    assert "turned alike" not in report.text(document([row("LR")]))
 
 
 def test_the_order_of_the_rows_is_kept(rows):
@@ -96,10 +183,10 @@ def test_the_order_of_the_rows_is_kept(rows):
         names = [r.method for r in order]
         r = document(order)
         assert list(r["methods"]) == names
-        lines = [line.split()[0] for line in report.text(r).splitlines() if line]
+        lines = [line.split()[0] for line in report.text(r).splitlines() if "±" in line]
         assert [word for word in lines if word in METHODS] == names
         cells = [line.split("|")[1] for line in report.markdown(r).splitlines() if "|" in line]
-        assert [cell.strip() for cell in cells[2:]] == names
+        assert [cell.strip() for cell in cells[2 : 2 + len(names)]] == names
 
 
 def test_a_method_stands_once(rows):
@@ -112,7 +199,8 @@ def test_the_papers_numbers_stand_beside_ours(rows, robot):
     r = document(rows, robot)
     for shown in (report.text(r), report.markdown(r)):
         for name in ("RS", "RL", "GE", "LR"):
-            (line,) = [x for x in shown.splitlines() if x.strip("| ").split()[0:1] == [name]]
+            lines = [x for x in shown.splitlines() if "±" in x]
+            (line,) = [x for x in lines if x.strip("| ").split()[0] == name]
             mean, std = report.TABLE1[robot][name]
             assert f"{mean:.3f} ± {std:.3f}" in line
             assert f"{r['methods'][name]['mean']:.3f} ± {r['methods'][name]['std']:.3f}" in line
@@ -120,13 +208,13 @@ def test_the_papers_numbers_stand_beside_ours(rows, robot):
 
 def test_the_paper_has_no_heading_frame(rows):
     r = document(rows)
-    (line,) = [x for x in report.markdown(r).splitlines() if x.startswith("| HF")]
+    (line,) = [x for x in report.markdown(r).splitlines() if x.startswith("| HF ")]
     assert line.endswith("|  |")
     assert len(report.text(document(rows, "another robot"))) > 0
 
 
 def test_the_text_fits_a_terminal_and_is_aligned(rows):
-    lines = report.text(document([*rows, row("LR literal")])).splitlines()
+    lines = report.text(document([*rows, row("LR literal", 3)])).splitlines()
     assert max(map(len, lines)) <= 120
     body = lines[4 : 4 + len(METHODS)]
     assert [line.split()[0] for line in body] == list(METHODS)
@@ -137,7 +225,9 @@ def test_the_text_fits_a_terminal_and_is_aligned(rows):
 
 def test_markdown_rows_have_one_cell_a_column(rows):
     lines = [x for x in report.markdown(document(rows)).splitlines() if x.startswith("|")]
-    assert {line.count("|") for line in lines} == {len(table.HEADER) + 1}
+    first, second = lines[: 2 + len(rows)], lines[2 + len(rows) :]
+    assert {line.count("|") for line in first} == {len(table.HEADER) + 1}
+    assert {line.count("|") for line in second} == {len(table.COMPARED) + 1}
 
 
 def test_a_number_that_does_not_exist_is_null_and_a_dash():
@@ -217,8 +307,24 @@ def test_paths(tmp_path):
     for ax in fig.axes:
         assert ax.get_aspect() == 1.0
         assert len(ax.patches) >= 10
-    for colour in (figures.STYLES["GE"].colour, figures.STYLES["LR"].colour, figures.TARGET_RED):
+    for colour in (drawing.STYLES["GE"].colour, drawing.STYLES["LR"].colour, figures.TARGET_RED):
         assert holds(pixels, colour)
+
+
+def test_many_methods_stand_in_bands(tmp_path):
+    names = [*METHODS, "VGCP", "HER_SP"]
+    target = np.array([[3.0, 0.0]])
+    ways = {name: [np.linspace(0, 0.3 * i, 9)[:, None] * target] for i, name in enumerate(names)}
+    panels = [("seen", ways, target, 0.0), ("unseen", ways, -target, np.pi)]
+    fig = report.paths(panels, tmp_path / "paths.png")
+    drawn(fig, tmp_path / "paths.png")
+    assert [ax.get_title() for ax in fig.axes] == [
+        *(*names[:4], *[""] * 4),
+        *(*names[4:], *[""] * 3),
+    ]
+    for ax, name in zip(fig.axes[8:11], names[4:], strict=True):
+        assert ax.lines[0].get_color() == drawing.styles(names)[name].colour
+        assert ax.lines[0].get_xdata()[-1] == pytest.approx(0.9 * names.index(name))
 
 
 def test_learning_curves(tmp_path):
@@ -231,6 +337,85 @@ def test_learning_curves(tmp_path):
     assert (reward.get_ylabel(), reward.get_xlabel()) == ("episode reward", "interactions")
     assert (reward.get_yscale(), loss.get_yscale()) == ("linear", "log")
     drawn(report.learning_curves({"RL": curve}, path, keys=["loss"]), path)
+
+
+def test_runs_of_one_agent_are_drawn_alike(tmp_path):
+    curve = [{"step": s, "reward": 0.01 * s} for s in range(0, 100, 10)]
+    curves = {"PPO, seed 0": curve, "PPO, seed 1": curve[1:], "SAC, seed 0": curve}
+    fig = report.learning_curves(curves, tmp_path / "curves.png")
+    (ax,) = fig.axes
+    first, second, other = (line.get_color() for line in ax.lines)
+    assert first == second != other
+    assert [t.get_text() for t in fig.legends[0].get_texts()] == ["PPO", "SAC"]
+
+
+ANGLES = np.radians(np.arange(0, 181, 15))
+
+
+def changes(level: float) -> np.ndarray:
+    noise = np.random.default_rng(0).lognormal(0, 0.5, (13, 400))
+    return level * np.sin(ANGLES / 2)[:, None] * noise
+
+
+def test_invariance(tmp_path):
+    path = tmp_path / "invariance.png"
+    given = {"RL": changes(1.5), "LR": changes(0.2), "HF": changes(3e-6)}
+    fig = report.invariance(given, ANGLES, path)
+    pixels = drawn(fig, path)
+    (ax,) = fig.axes
+    assert ax.get_yscale() == "symlog" and ax.get_ylim()[0] < 0 < ax.get_ylim()[1]
+    for name, values in given.items():
+        assert holds(pixels, drawing.STYLES[name].colour)
+        container = next(
+            c for c in ax.containers if c[0].get_color() == drawing.STYLES[name].colour
+        )
+        line, _, (bars,) = container
+        assert line.get_ydata() == pytest.approx(np.median(values, axis=1))
+        assert line.get_xdata() == pytest.approx(np.degrees(ANGLES), abs=7)
+        ends = np.array([segment[:, 1] for segment in bars.get_segments()])
+        assert ends == pytest.approx(np.percentile(values, [25, 75], axis=1).T)
+
+
+def test_only_float_noise_is_called_so(tmp_path):
+    given = {"LR": changes(0.2), "HF": changes(3e-6), "exact": np.zeros((13, 5))}
+    fig = report.invariance(given, ANGLES, tmp_path / "invariance.png")
+    most = f"{given['HF'].max():.0e}".replace("e-0", "e-")
+    said = [text.get_text() for text in fig.axes[0].texts]
+    assert said == [f"HF: at most {most}, float noise", "exact: exactly 0"]
+
+
+@pytest.mark.parametrize("fits", [1, 3])
+def test_latent_sizes(tmp_path, fits):
+    rng = np.random.default_rng(0)
+    closest = {k: [rng.gamma(4, 0.2, (5, 40)) for _ in range(fits)] for k in (111, 2, 10)}
+    closest[2][0][0, 0] = np.nan
+    path = tmp_path / "sizes.png"
+    fig = report.latent_sizes(closest, path, chosen=10)
+    drawn(fig, path)
+    (ax,) = fig.axes
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["2", "10", "111"]
+    ((line, _, (bars,)),) = ax.containers
+    means = {k: [np.nanmean(fit) for fit in closest[k]] for k in (2, 10, 111)}
+    assert line.get_xdata() == pytest.approx([2, 10, 111])
+    assert line.get_ydata() == pytest.approx([np.mean(m) for m in means.values()])
+    ends = np.array([segment[:, 1] for segment in bars.get_segments()])
+    spread = [
+        np.mean(m) + np.std(m, ddof=1) * np.array([-1, 1]) for m in means.values() if fits > 1
+    ]
+    interval = [stats.interval(closest[k][0]) for k in means]
+    assert ends == pytest.approx(np.array(spread if fits > 1 else interval))
+    single = [each for each in ax.lines if each.get_markerfacecolor() == "white"]
+    assert len(single) == (fits > 1)
+    for each in single:
+        assert each.get_ydata() == pytest.approx(np.concatenate(list(means.values())))
+    assert [10, 10] in [list(each.get_xdata()) for each in ax.lines], "the k of Table 1"
+    named = "fits" if fits > 1 else "test seeds"
+    assert named in fig.legends[0].get_texts()[0].get_text()
+
+
+def test_a_light_colour_has_an_edge():
+    edged = [name for name, s in drawing.STYLES.items() if "path_effects" in drawing.strokes(s)]
+    assert edged == ["HER_SP"], "yellow"
 
 
 def test_residuals(tmp_path):
@@ -259,16 +444,16 @@ def test_bearings_show_the_mean_of_each_bin(tmp_path):
     drawn(fig, path)
     left, right = fig.axes
     assert left.lines[0].get_ydata() == pytest.approx([0.5] * 3 + [2.0] * 3)
-    colour = figures.STYLES["LR"].colour
+    colour = drawing.STYLES["LR"].colour
     behind = next(line for line in right.lines if line.get_color() == colour)
     assert behind.get_ydata() == pytest.approx([1.0] * 3 + [0.25] * 6 + [1.0] * 3)
 
 
 def test_styles_are_one_a_method_and_told_apart_without_colour():
-    known = figures.styles(figures.STYLES)
-    assert known == figures.STYLES
-    assert figures.styles(["mine", "LR"])["LR"] == figures.STYLES["LR"]
-    mixed = figures.styles(["LR", "mine", "GE", "yours"])
+    known = drawing.styles(drawing.STYLES)
+    assert known == drawing.STYLES
+    assert drawing.styles(["mine", "LR"])["LR"] == drawing.STYLES["LR"]
+    mixed = drawing.styles(["LR", "mine", "GE", "yours"])
     for several in (known, mixed):
         for a, b in itertools.combinations(several.values(), 2):
             assert a.colour != b.colour

@@ -140,12 +140,82 @@ def test_paired_refuses_other_scenarios():
         stats.paired(a, outcome([[1.0, 2.0]], start=[[3.0, 3.1]]))
 
 
-def test_spread_over_collecting_seeds():
+def test_improvement_is_scipys_percentile_of_no_difference():
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 7, 500):
+        difference = rng.integers(-2, 3, n).astype(float)
+        theirs = scipy.stats.percentileofscore(difference, 0, kind="mean") / 100
+        assert stats.improvement(difference) == pytest.approx(theirs)
+    assert stats.improvement(np.array([-1.0, np.nan, np.nan, 2.0])) == 0.5
+    assert np.isnan(stats.improvement(np.array([np.nan])))
+
+
+def test_the_common_part_of_two_banks_is_the_beginning_of_both():
+    a, b = random(seeds=4, episodes=50), random(seeds=6, episodes=20, rng=1)
+    for cut, whole in zip(stats.common(a, b), (a, b), strict=True):
+        assert cut.closest.shape == cut.steps.shape == (4, 20)
+        assert np.array_equal(cut.closest, whole.closest[:4, :20])
+        assert np.array_equal(cut.path_length, whole.path_length[:4, :20])
+
+
+def test_spread_over_training_seeds():
     runs = [outcome([[1.0, 3.0]]), outcome([[3.0, 3.0]]), outcome([[4.0, 9.0]], diverged=[[0, 1]])]
     s = stats.spread(runs)
     assert s["means"] == [2.0, 3.0, 4.0]
     assert (s["mean"], s["std"]) == (3.0, 1.0)
     assert np.isnan(stats.spread(runs[:1])["std"])
+
+
+def test_a_training_seeds_episodes_are_averaged_first():
+    """Ten thousand episodes of one training seed weigh no more than ten of another."""
+    runs = [outcome(np.full((1, 10_000), 1.0)), outcome([[3.0, 3.0]]), outcome([[5.0]])]
+    assert stats.spread(runs)["mean"] == 3.0
+    assert stats.spread(runs)["ci95"] == [1.0, 5.0]
+
+
+def test_the_interval_over_training_seeds_is_scipys_bootstrap_of_their_means():
+    runs = [random(seeds=3, episodes=20, rng=n, shift=0.3 * n) for n in range(6)]
+    means = np.array([run.closest.astype(float).mean() for run in runs])
+    theirs = scipy.stats.bootstrap(
+        (means,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    ).confidence_interval
+    low, high = stats.spread(runs)["ci95"]
+    width = theirs.high - theirs.low
+    assert low == pytest.approx(theirs.low, abs=0.05 * width)
+    assert high == pytest.approx(theirs.high, abs=0.05 * width)
+
+
+def test_an_interval_over_training_seeds_takes_three_of_them():
+    runs = [outcome([[x]]) for x in (1.0, 2.0, 4.0)]
+    assert np.isnan(stats.spread(runs[:2])["ci95"]).all()
+    assert stats.spread(runs)["ci95"] == [1.0, 4.0], "the least and the greatest"
+    lost = [*runs[:2], outcome([[4.0]], diverged=True)]
+    assert np.isnan(stats.spread(lost)["ci95"]).all(), "one that has no mean does not count"
+
+
+def test_paired_spread_sees_through_what_the_training_seeds_share():
+    level = [3.0, 1.0, 2.0, 5.0]
+    a = [outcome([[x - 0.1, x - 0.3]]) for x in level]
+    b = [outcome([[x, x]]) for x in level]
+    over = stats.paired_spread(a, b)
+    assert over["means"] == pytest.approx([-0.2] * 4)
+    assert over["ci95"] == pytest.approx([-0.2, -0.2])
+    assert over["improvement"] == 1.0
+    assert stats.spread(a)["ci95"][1] > stats.spread(b)["ci95"][0], "unpaired, they overlap"
+
+
+def test_paired_spread_counts_the_training_seeds_in_which_the_first_is_nearer():
+    a = [outcome([[x]]) for x in (1.0, 3.0, 2.0, 1.0)]
+    b = [outcome([[x]]) for x in (2.0, 2.0, 2.0, 9.0)]
+    assert stats.paired_spread(a, b)["improvement"] == (2 + 0.5) / 4
+
+
+def test_paired_spread_compares_the_scenarios_that_both_saw():
+    long, short = outcome([[1.0, 9.0, 9.0]]), outcome([[2.0]])
+    assert stats.paired_spread([long, short], [short, long])["means"] == [-1.0, 1.0]
+    other = outcome([[2.0]], start=[[4.0]])
+    with pytest.raises(ValueError, match="same scenarios"):
+        stats.paired_spread([long], [other])
 
 
 def test_paired_spread_pairs_the_runs_in_order():

@@ -9,8 +9,8 @@ import jax
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.collecting import record
 from experiments.benchmark.measuring import Probe, carried, timed
-from genidm.controller import Controller, load
-from genidm.evaluate import Queue, Test, Testing, evaluate, flatten
+from genidm.controller import load
+from genidm.evaluate import Queue, Steering, Test, Testing, evaluate, flatten
 from genidm.fit import fit
 from genidm.generalize import pairs, rotate
 from genidm.methods import LR
@@ -19,7 +19,7 @@ from genidm.scenarios import Scenarios, scenarios
 from genidm.store import Stage
 
 
-def controller(bench: Bench) -> Controller:
+def controller(bench: Bench) -> Steering:
     """That of the run, or an untrained one."""
     if bench.options.run:
         return load(bench.options.run / "controller", bench.robot)

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple, Protocol
 import jax
 from jax.sharding import Mesh
 
+from genidm.agents.policy import Policy
 from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import WalkForward
+from genidm.tasks import Task
 
 Metrics = dict[str, jax.Array]
 Iterate = Callable[[Any], tuple[Any, Experience, Metrics]]
@@ -45,5 +46,8 @@ class Agent(Protocol):
     @property
     def unroll(self) -> int: ...
 
-    def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         """The agent on this robot, its lanes sharded over the mesh."""
+
+    def policy(self, robot: Robot, task: Task, learner: Any) -> Policy | None:
+        """The policy of a learner, without exploration; None if it learns nothing."""

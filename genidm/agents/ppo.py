@@ -1,7 +1,7 @@
 """PPO (Schulman et al. 2017), composed from Brax's networks, losses and statistics.
 
 An iteration is two programs. In the first every device steps its own lanes; in the second
-the running statistics take the new states in, and the networks learn from the batch in
+the running statistics take the new inputs in, and the networks learn from the batch in
 `epochs` passes, on one device: networks this small learn faster than their gradients could
 be averaged (four CPU devices: 0.3 s an iteration instead of 0.6), what is learned does not
 depend on the number of devices, and no program waits for another device, which XLA's
@@ -29,11 +29,12 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.policy import Policy, no_statistics, normalize
 from genidm.errors import BadInput
 from genidm.experience import Experience, record
 from genidm.progress import compiled
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Step, WalkForward, metrics, split
+from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook, split
 
 # Of what Brax's loss reports, what is worth a curve.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
@@ -53,19 +54,6 @@ class Learner(flax.struct.PyTreeNode):
 
     lanes: Lanes
     mind: Mind
-
-
-class Policy(flax.struct.PyTreeNode):
-    """What PPO has learned, without exploration; steers like a controller, goals unheeded."""
-
-    statistics: RunningStatisticsState
-    params: Any
-    networks: ppo_networks.PPONetworks = flax.struct.field(pytree_node=False)
-
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        """Actions `[..., A]` for states `[..., S]`."""
-        logits = self.networks.policy_network.apply(self.statistics, self.params, s)
-        return self.networks.parametric_action_distribution.mode(logits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,26 +97,27 @@ class PPO:
             uneven = f"{self.lanes} lanes cannot be shared among {self.minibatches} minibatches"
             raise BadInput(f"{uneven} evenly")
 
-    def networks(self, robot: Robot) -> ppo_networks.PPONetworks:
-        """Brax's policy and value networks on normalised states."""
+    def networks(self, robot: Robot, task: Task) -> ppo_networks.PPONetworks:
+        """Brax's policy and value networks on normalised inputs."""
         return ppo_networks.make_ppo_networks(
-            robot.observation.size,
+            input_size(robot, task),
             robot.action.size,
-            preprocess_observations_fn=functools.partial(
-                running_statistics.normalize, max_abs_value=10.0
-            ),
+            preprocess_observations_fn=normalize,
             policy_hidden_layer_sizes=self.hidden,
             value_hidden_layer_sizes=self.value_hidden,
             activation=linen.tanh,
         )
 
-    def policy(self, robot: Robot, learner: Learner) -> Policy:
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
         """The policy of a learner, without exploration."""
         mind = learner.mind
-        return Policy(mind.statistics, mind.params.policy, self.networks(robot))
+        return Policy(
+            params=mind.params.policy, mean=mind.statistics.mean, std=mind.statistics.std,
+            hidden=self.hidden, activation="tanh", directed=task.directed, robot=robot,
+        )  # fmt: skip
 
-    def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
-        networks = self.networks(robot)
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        networks = self.networks(robot, task)
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
         )
@@ -145,7 +134,7 @@ class PPO:
                 mind=Mind(
                     params=params,
                     optimizer=optimizer.init(params),
-                    statistics=_statistics(robot.observation.size),
+                    statistics=no_statistics(input_size(robot, task)),
                     key=stream,
                 ),
             )
@@ -170,14 +159,16 @@ class PPO:
 
         return Learning(start, place, prepare)
 
-    def stepping(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Any:
+    def stepping(self, robot: Robot, task: Task, mesh: Mesh) -> Any:
         """The first program of an iteration: every device steps its own lanes.
 
         Returns:
           the jitted (*acting(mind, mesh), lanes `[B]`) → (lanes, Experience, Transition,
           metrics), all but the lanes `[unroll, B, ...]`; it donates the lanes.
         """
-        walk = functools.partial(_walk, robot, task, self.networks(robot), self.unroll)
+        walk = functools.partial(
+            _walk, robot, task, self.networks(robot, task), self.unroll, self.discount
+        )
         sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
         return jax.jit(sharded, donate_argnums=2)
 
@@ -222,12 +213,6 @@ class PPO:
         return Mind(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
 
 
-def _statistics(size: int) -> RunningStatisticsState:
-    """Of no states yet; of strong types, as those from a checkpoint: one program serves both."""
-    state = running_statistics.init_state(jnp.zeros(size))
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
-
-
 def acting(mind: Mind, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
     """What of a mind chooses actions: statistics and policy, a copy on every device."""
     return devices.put((mind.statistics, mind.params.policy), mesh, None)
@@ -235,9 +220,10 @@ def acting(mind: Mind, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
 
 def _walk(
     robot: Robot,
-    task: WalkForward,
+    task: Task,
     networks: ppo_networks.PPONetworks,
     unroll: int,
+    discount: float,
     statistics: RunningStatisticsState,
     policy: Any,
     lanes: Lanes,
@@ -247,7 +233,8 @@ def _walk(
 
     def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Transition, Metrics]]:
         lanes, keys = split(lanes)
-        logits = networks.policy_network.apply(statistics, policy, lanes.robots.observation)
+        before = inputs(lanes.robots.observation, lanes.displacement)
+        logits = networks.policy_network.apply(statistics, policy, before)
         raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
         choice = {
             "distribution_params": logits,
@@ -255,7 +242,8 @@ def _walk(
             "log_prob": distribution.log_prob(logits, raw),
         }
         lanes, seen = task.advance(robot, lanes, distribution.postprocess(raw))
-        return lanes, (record(seen), transition(seen, choice), metrics(robot, seen))
+        batch = transition(seen, choice, discount)
+        return lanes, (record(seen), batch, task.metrics(robot, seen))
 
     lanes, (experience, batch, seen) = jax.lax.scan(step, lanes, length=unroll)
     # The loss reads no next state but the one after the last step.
@@ -263,14 +251,14 @@ def _walk(
     return lanes, experience, batch, seen
 
 
-def transition(step: Step, choice: dict[str, jax.Array]) -> Transition:
+def transition(step: Step, choice: dict[str, jax.Array], discount: float) -> Transition:
     """What Brax's loss reads of a step `[B]` and of how its action was chosen."""
     return Transition(
-        observation=step.before.observation,
+        observation=inputs(step.before.observation, step.displacement(step.before)),
         action=step.action,
-        reward=step.reward,
+        reward=outlook(step, discount),
         discount=1.0 - step.terminal,
-        next_observation=step.after.observation,
+        next_observation=inputs(step.after.observation, step.displacement(step.after)),
         extras={
             "policy_extras": choice,
             "state_extras": {"truncation": 1.0 * (step.last & ~step.terminal)},

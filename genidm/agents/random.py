@@ -15,7 +15,7 @@ from genidm.errors import BadInput
 from genidm.experience import Experience, record
 from genidm.progress import compiled
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, WalkForward, metrics, split
+from genidm.tasks import Lanes, Task, split
 
 
 class Learner(flax.struct.PyTreeNode):
@@ -40,13 +40,16 @@ class RandomActions:
         if self.lanes < 1 or self.unroll < 1:
             raise BadInput("random sampling needs lanes and unroll of at least 1")
 
-    def learning(self, robot: Robot, task: WalkForward, mesh: Mesh) -> Learning:
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> None:
+        """There is none: nothing is learned."""
+
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         draw = jax.vmap(lambda key: jax.random.uniform(key, (robot.action.size,), minval=-1.0))
 
         def step(lanes: Lanes, _: None) -> tuple[Lanes, Any]:
             lanes, keys = split(lanes)
             lanes, transition = task.advance(robot, lanes, draw(keys))
-            return lanes, (record(transition), metrics(robot, transition))
+            return lanes, (record(transition), task.metrics(robot, transition))
 
         def walk(lanes: Lanes) -> tuple[Lanes, Any]:
             return jax.lax.scan(step, lanes, length=self.unroll)

@@ -1,13 +1,24 @@
 """Tables and figures from episodes: everything here derives from what the evaluation left."""
 
-from genidm.report.figures import bearings, learning_curves, paths, residuals, violins
+from genidm.report.figures import (
+    bearings,
+    invariance,
+    latent_sizes,
+    learning_curves,
+    paths,
+    residuals,
+    violins,
+)
 from genidm.report.paper import TABLE1
-from genidm.report.table import Row, markdown, results, text
+from genidm.report.rows import Row, results
+from genidm.report.table import markdown, text
 
 __all__ = [
     "TABLE1",
     "Row",
     "bearings",
+    "invariance",
+    "latent_sizes",
     "learning_curves",
     "markdown",
     "paths",

@@ -1,17 +1,9 @@
-"""The figures, each a function of data and a path that writes a PNG and returns the Figure.
-
-A method has one colour, marker, line and hatch in every figure (`STYLES`). The colours are
-Okabe and Ito's, which the colour-blind tell apart; the others do it in grey print.
-Nothing here touches pyplot or its global state.
-"""
+"""The figures, each a function of data and a path that writes a PNG and returns the Figure."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import os
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,26 +11,32 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, NullLocator
 
 from genidm import stats
-from genidm.report.table import Row
+from genidm.report import drawing
+from genidm.report.drawing import Array, Style, Target, styles
+from genidm.report.paper import METHOD
+from genidm.report.rows import Row
 
-Array = np.ndarray
-Target = str | os.PathLike[str]
 Panel = tuple[str, Mapping[str, Sequence[Array]], Array, float]
 
-DPI = 150
 TARGET_RADIUS = 0.1  # metres; what counts as reached, drawn to scale
+ABREAST = 5  # methods side by side in a figure of ways
 BESIDE = 0.2  # of the distance between violins; how far from the middle the means stand
 TARGET_RED = "#D00000"
 FLOOR = 1e-8  # metres; where a log axis shows a residual of exactly 0
+LINEAR = 1e-2  # changes of the action below this are on the linear part of their axis
+NOISE = 1e-3  # and below this, float noise
+CHOSEN: dict[str, Any] = {"color": "0.45", "linestyle": (0, (6, 3)), "linewidth": 1}
+SINGLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "mfc": "white", "ms": 5}
 
 METRICS = {
     "episode_reward": "episode reward",
     "reward": "reward",
     "forward_speed": "forward speed, m/s",
-    "speed": "forward speed, m/s",
+    "speed": "speed ahead / to goal, m/s",
+    "reached": "arrivals a step",
     "fell": "share of falls",
     "episode_length": "episode length, steps",
     "loss": "loss L (Eq. 7)",
@@ -46,54 +44,6 @@ METRICS = {
     "loss_action": "action loss L2 (Eq. 6)",
 }
 """Metric → label of its axis; any other metric is labelled by its own name."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Style:
-    """How a method is drawn.
-
-    Attributes:
-      colour: hexadecimal RGB.
-      marker, line, hatch: Matplotlib's codes.
-    """
-
-    colour: str
-    marker: str
-    line: Any
-    hatch: str
-
-
-_DASHES = (0, (6, 1.5, 1.5, 1.5))
-STYLES = {
-    "RS": Style("#8C8C8C", "x", ":", ""),
-    "RL": Style("#E69F00", "s", "--", "//"),
-    "VGCP": Style("#56B4E9", "v", "-.", "\\\\"),
-    "HER_SP": Style("#F0E442", "<", _DASHES, "--"),
-    "HER_DE": Style("#CC79A7", ">", (0, (1, 1)), "||"),
-    "GE": Style("#009E73", "^", "-.", "xx"),
-    "LR": Style("#0072B2", "o", "-", ".."),
-    "HF": Style("#D55E00", "D", (0, (5, 1)), "++"),
-}
-"""Method → style, the same in every figure."""
-
-_SPARE = (
-    Style("#0072B2", "o", "-", ""),
-    Style("#D55E00", "s", "--", "//"),
-    Style("#009E73", "^", "-.", "xx"),
-    Style("#CC79A7", "v", _DASHES, "\\\\"),
-    Style("#56B4E9", "P", (0, (5, 1)), "++"),
-    Style("#E69F00", "X", (0, (1, 1)), "||"),
-    Style("#882255", "D", ":", "oo"),
-)
-
-
-def styles(names: Iterable[str]) -> dict[str, Style]:
-    """A style for each name: a method's own, and for the others what no method here uses."""
-    names = list(names)
-    taken = {STYLES[n].colour for n in names if n in STYLES}
-    free = [s for s in _SPARE if s.colour not in taken] or list(_SPARE)
-    spare = itertools.cycle(free)
-    return {name: STYLES[name] if name in STYLES else next(spare) for name in names}
 
 
 def violins(
@@ -116,13 +66,15 @@ def violins(
     _start_line(ax, rows)
     ax.set_xticks(range(len(rows)), [row.method for row in rows])
     ax.set_ylim(bottom=0)
-    _dress(ax, "", "closest distance to the target, m")
-    _key(fig, _violin_key(bool(paper)))
-    return _write(fig, path)
+    drawing.dress(ax, "", "closest distance to the target, m")
+    drawing.key(fig, _violin_key(bool(paper)))
+    return drawing.write(fig, path)
 
 
 def paths(panels: Sequence[Panel], path: Target) -> Figure:
     """Ways walked towards targets seen and unseen while learning (Fig. 8), one row a panel.
+
+    More methods than a page is wide stand in bands below each other.
 
     Args:
       panels: (title, method → ways, each `[T, 2]` metres, targets `[E, 2]` metres, heading at
@@ -130,22 +82,20 @@ def paths(panels: Sequence[Panel], path: Target) -> Figure:
       path: PNG to write.
     """
     methods = list(dict.fromkeys(name for panel in panels for name in panel[1]))
-    size = (max(4.0, 2.3 * len(methods) + 0.7), 2.45 * len(panels) + 0.8)
-    fig = Figure(figsize=size, layout="constrained")
-    grid = fig.subplots(len(panels), len(methods), squeeze=False, sharex="row", sharey="row")
+    bands = _bands(methods)
+    rows, columns = len(bands) * len(panels), len(bands[0])
+    fig = Figure(figsize=(max(4.0, 2.3 * columns + 0.7), 2.45 * rows + 0.8), layout="constrained")
+    grid = fig.subplots(rows, columns, squeeze=False, sharex="row", sharey="row")
     looks = styles(methods)
-    for axes, (title, ways, targets, heading) in zip(grid, panels, strict=True):
-        limits = _square([np.asarray(targets), *itertools.chain(*ways.values())])
-        for ax, name in zip(axes, methods, strict=True):
-            _targets(ax, targets)
-            _ways(ax, ways.get(name, ()), looks[name], heading, limits)
-            ax.set(xlim=limits[0], ylim=limits[1], aspect="equal")
-            _dress(ax, "", "")
-            ax.grid(False)
-        axes[0].set_ylabel(f"{title}\ny, m", fontsize=11)
-    _head_and_foot(grid, methods)
-    _key(fig, _path_key(), "lower")
-    return _write(fig, path)
+    for axes, (names, panel) in zip(grid, itertools.product(bands, panels), strict=True):
+        _panel(axes, names, panel, looks)
+    for axes, names in zip(grid[:: len(panels)], bands, strict=True):
+        for ax, name in zip(axes, names, strict=False):
+            ax.set_title(name, fontsize=12)
+    for ax in grid[-1]:
+        ax.set_xlabel("x, m", fontsize=11)
+    drawing.key(fig, _path_key(), "lower")
+    return drawing.write(fig, path)
 
 
 def learning_curves(
@@ -158,7 +108,8 @@ def learning_curves(
 
     Args:
       curves: label → records with "step" and metrics, as a run's JSONL holds them; a record
-        need not hold every metric.
+        need not hold every metric. What stands behind a comma in a label ("PPO, seed 1")
+        names one of several runs, which are drawn alike.
       path: PNG to write.
       keys: the metrics to draw, in order; by default every number of the records.
       steps: what "step" counts, the label of the horizontal axis ("interactions", "updates").
@@ -168,14 +119,14 @@ def learning_curves(
     rows = max(1, -(-len(keys) // columns))
     fig = Figure(figsize=(3.7 * columns + 0.4, 2.9 * rows + 0.5), layout="constrained")
     axes = fig.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08}).ravel()
-    looks = styles(curves)
+    looks = styles(dict.fromkeys(map(_family, curves)))
     for ax, key in zip(axes, keys, strict=False):
         _curve_panel(ax, curves, key, looks)
-        _dress(ax, steps, METRICS.get(key, key.replace("_", " ")))
+        drawing.dress(ax, steps, METRICS.get(key, key.replace("_", " ")))
     for ax in axes[len(keys) :]:
         ax.set_visible(False)
-    _line_key(fig, looks)
-    return _write(fig, path)
+    drawing.line_key(fig, looks)
+    return drawing.write(fig, path)
 
 
 def residuals(curves: Mapping[str, Mapping[str, Array]], path: Target) -> Figure:
@@ -195,13 +146,13 @@ def residuals(curves: Mapping[str, Mapping[str, Array]], path: Target) -> Figure
     if any(np.min(curve["median"]) < FLOOR for curve in curves.values()):
         ax.text(1, 1.4 * FLOOR, "exactly 0, or less than the axis shows", fontsize=9)
     ax.set_ylim(bottom=FLOOR / 2)
-    _dress(ax, "steps since placing", "distance to the exact rotation, m")
+    drawing.dress(ax, "steps since placing", "distance to the exact rotation, m")
     kinds = [
         Line2D([], [], color="0.25", lw=2.2, label="median"),
         Line2D([], [], color="0.25", lw=0.9, label="90th percentile"),
     ]
-    _line_key(fig, looks, kinds)
-    return _write(fig, path)
+    drawing.line_key(fig, looks, kinds)
+    return drawing.write(fig, path)
 
 
 def bearings(closest: Mapping[str, Array], bearing: Array, heading: Array, path: Target) -> Figure:
@@ -225,59 +176,77 @@ def bearings(closest: Mapping[str, Array], bearing: Array, heading: Array, path:
         _bins(right, turned, values, np.linspace(-180, 180, 13), looks[name], shift)
     left.set(xticks=np.arange(-45, 46, 15), ylim=(0, None))
     right.set_xticks(np.arange(-180, 181, 60))
-    _dress(
+    drawing.dress(
         left,
         "bearing of the target, degrees (left is positive)",
         "closest distance to the target, m",
     )
-    _dress(right, "heading at the start in the world, degrees", "")
-    _line_key(fig, looks)
-    return _write(fig, path)
+    drawing.dress(right, "heading at the start in the world, degrees", "")
+    drawing.line_key(fig, looks)
+    return drawing.write(fig, path)
 
 
-def _write(fig: Figure, path: Target) -> Figure:
-    """Writes beside `path` and moves into place, so that no reader sees half a picture."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        # Without the version of Matplotlib in it, equal figures are equal files.
-        fig.savefig(part, dpi=DPI, format="png", metadata={"Software": None})
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    return fig
+def invariance(changes: Mapping[str, Array], angle: Array, path: Target) -> Figure:
+    """How much actions change when robot and goal are turned alike, by angle (Def. 3).
+
+    Marks are medians over states, bars their quartiles. The axis is linear below `LINEAR`, so
+    that 0 stands on it; a method that never leaves float noise is named beside its number.
+
+    Args:
+      changes: method → Euclidean distances of the actions `[K, N]`, of N states.
+      angle: radians `[K]`, that they are turned by.
+      path: PNG to write.
+    """
+    fig = Figure(figsize=(7.4, 4.6), layout="constrained")
+    ax = fig.add_subplot()
+    ax.set_yscale("symlog", linthresh=LINEAR, linscale=0.6)
+    looks, degrees = styles(changes), np.degrees(angle)
+    step = float(np.diff(degrees).min()) if len(degrees) > 1 else 1.0
+    for shift, (name, values) in zip(_shifts(len(changes), 0.3), changes.items(), strict=True):
+        low, median, high = np.percentile(np.asarray(values, float), [25, 50, 75], axis=1)
+        bars = np.stack([median - low, high - median])
+        _bars(ax, degrees + shift * step, median, bars, looks[name])
+    ax.set(ylim=(-0.1 * LINEAR, None), xticks=np.arange(0, 181, 30))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    _name_noise(ax, changes)
+    drawing.dress(ax, "turned by, degrees", "change of the action (Def. 3)")
+    drawing.line_key(fig, looks)
+    return drawing.write(fig, path)
 
 
-def _dress(ax: Axes, xlabel: str, ylabel: str) -> None:
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(labelsize=10)
-    ax.grid(axis="y", color="0.9", linewidth=0.8)
-    ax.set_axisbelow(True)
-    if xlabel:
-        ax.set_xlabel(xlabel, fontsize=11)
-    if ylabel:
-        ax.set_ylabel(ylabel, fontsize=11)
+def latent_sizes(
+    closest: Mapping[int, Sequence[Array]], path: Target, chosen: int | None = None
+) -> Figure:
+    """Closest distance against the size k of the latent (Fig. 9).
 
+    The line is the mean over fits, with the 95 % interval over test seeds of one fit, or the
+    standard deviation over several, which are also shown one by one.
 
-def _line_key(fig: Figure, looks: Mapping[str, Style], extra: Sequence[Line2D] = ()) -> None:
-    lines = [
-        Line2D([], [], color=s.colour, marker=s.marker, linestyle=s.line, label=name)
-        for name, s in looks.items()
-    ]
-    _key(fig, [*lines, *extra])
-
-
-def _key(fig: Figure, handles: Sequence[Line2D], edge: str = "upper") -> None:
-    """A legend above or below the axes, in as many columns as fit."""
-    if not handles:
-        return
-    # Inches at 9 points: a handle with its gaps, and a letter.
-    widths = [0.73 + 0.07 * len(str(h.get_label())) for h in handles]
-    fitting = max(1, int(fig.get_figwidth() / max(widths)))
-    columns = len(handles) if sum(widths) < fig.get_figwidth() else min(len(handles), fitting)
-    place: Any = f"outside {edge} center"
-    fig.legend(handles=handles, loc=place, ncols=columns, fontsize=9, handlelength=3)
+    Args:
+      closest: k → each fit's closest distances in metres, `[seeds, episodes]`; NaN is left
+        out.
+      path: PNG to write.
+      chosen: the k that Table 1 has; marked.
+    """
+    fig = Figure(figsize=(6.4, 4.2), layout="constrained")
+    ax = fig.add_subplot()
+    sizes, style = sorted(closest), drawing.STYLES[METHOD]
+    means = [[float(np.nanmean(fit)) for fit in closest[k]] for k in sizes]
+    several = all(len(fits) > 1 for fits in means)
+    middle = np.array([np.mean(fits) for fits in means])
+    bars = _deviations(means) if several else _intervals([closest[k][0] for k in sizes], middle)
+    if chosen is not None:
+        ax.axvline(chosen, **CHOSEN)
+    if several:
+        x = np.repeat(np.multiply(sizes, 1.07), [len(fits) for fits in means])  # beside the bars
+        ax.plot(x, np.concatenate(means), **SINGLE, color=style.colour)
+    _bars(ax, np.asarray(sizes, float), middle, bars, style)
+    ax.set_xscale("log")
+    ax.set(xticks=sizes, xticklabels=[str(k) for k in sizes], ylim=(0, None))
+    ax.xaxis.set_minor_locator(NullLocator())
+    drawing.dress(ax, "size k of the latent", "closest distance to the target, m")
+    drawing.key(fig, _size_key(style, several, chosen))
+    return drawing.write(fig, path)
 
 
 def _violin(ax: Axes, x: float, values: Array, style: Style) -> None:
@@ -315,6 +284,28 @@ def _violin_key(paper: bool) -> list[Line2D]:
     return key if paper else [*key[:3], key[4]]
 
 
+def _bands(names: Sequence[str]) -> list[list[str]]:
+    """Names in as few rows as hold them, the rows as even as can be."""
+    count = max(1, -(-len(names) // ABREAST))
+    width = -(-len(names) // count)
+    return [list(names[i * width : (i + 1) * width]) for i in range(count)]
+
+
+def _panel(axes: Array, names: Sequence[str], panel: Panel, looks: Mapping[str, Style]) -> None:
+    """A row of axes `[columns]`, one a method; those that are left over go."""
+    title, ways, targets, heading = panel
+    limits = _square([np.asarray(targets), *itertools.chain(*ways.values())])
+    for ax, name in zip(axes, names, strict=False):
+        _targets(ax, targets)
+        _ways(ax, ways.get(name, ()), looks[name], heading, limits)
+        ax.set(xlim=limits[0], ylim=limits[1], aspect="equal")
+        drawing.dress(ax, "", "")
+        ax.grid(False)
+    axes[0].set_ylabel(f"{title}\ny, m", fontsize=11)
+    for ax in axes[len(names) :]:
+        ax.remove()
+
+
 def _targets(ax: Axes, targets: Array) -> None:
     for x, y in np.asarray(targets):
         disc = Circle((x, y), TARGET_RADIUS, facecolor=TARGET_RED, edgecolor="black", zorder=5)
@@ -328,8 +319,9 @@ def _ways(
     heading: float,
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
+    line = drawing.strokes(style) | {"marker": "", "linestyle": "-", "linewidth": 1.2}
     for way in map(np.asarray, ways):
-        ax.plot(way[:, 0], way[:, 1], color=style.colour, linewidth=1.2)
+        ax.plot(way[:, 0], way[:, 1], **line)
         ax.plot(*way[-1], marker=style.marker, color=style.colour, mec="black", mew=0.6, ms=5)
     if len(ways):
         length = 0.12 * (limits[0][1] - limits[0][0])
@@ -348,13 +340,6 @@ def _square(points: Iterable[Array]) -> tuple[tuple[float, float], tuple[float, 
     return x, y
 
 
-def _head_and_foot(grid: Array, methods: Sequence[str]) -> None:
-    for ax, name in zip(grid[0], methods, strict=True):
-        ax.set_title(name, fontsize=12)
-    for ax in grid[-1]:
-        ax.set_xlabel("x, m", fontsize=11)
-
-
 def _path_key() -> list[Line2D]:
     dot: dict[str, Any] = {"linestyle": "none", "color": "black"}
     return [
@@ -370,6 +355,11 @@ def _metrics(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     return [key for key in found if key != "step"]
 
 
+def _family(label: str) -> str:
+    """What runs that are drawn alike have in common: the label up to a comma."""
+    return label.partition(",")[0]
+
+
 def _curve_panel(
     ax: Axes,
     curves: Mapping[str, Sequence[Mapping[str, Any]]],
@@ -381,17 +371,11 @@ def _curve_panel(
     for name, records in curves.items():
         points = np.array([(r["step"], r[key]) for r in records if key in r], float)
         if points.size:
-            _line(ax, points[:, 0], points[:, 1], looks[name])
+            drawing.line(ax, points[:, 0], points[:, 1], looks[_family(name)])
             least = min(least, np.min(points[:, 1]))
     if key.startswith("loss") and 0 < least < np.inf:
         ax.set_yscale("log")
     ax.xaxis.set_major_formatter(EngFormatter())
-
-
-def _line(ax: Axes, x: Array, y: Array, style: Style, width: float = 1.8, marks: int = 8) -> None:
-    every = max(1, len(x) // marks)
-    marker: dict[str, Any] = {"marker": style.marker, "markevery": every, "markersize": 5}
-    ax.plot(x, y, color=style.colour, linestyle=style.line, linewidth=width, **marker)
 
 
 def _residual(ax: Axes, curve: Mapping[str, Array], style: Style) -> None:
@@ -409,9 +393,44 @@ def _residual(ax: Axes, curve: Mapping[str, Array], style: Style) -> None:
         )
 
 
-def _shifts(count: int) -> Array:
+def _name_noise(ax: Axes, changes: Mapping[str, Array]) -> None:
+    """Numbers for the methods whose changes are too small for the axis."""
+    greatest = {name: float(np.max(values)) for name, values in changes.items()}
+    for row, (name, most) in enumerate((n, m) for n, m in greatest.items() if m < NOISE):
+        number = f"{most:.0e}".replace("e-0", "e-")
+        text = f"{name}: at most {number}, float noise" if most else f"{name}: exactly 0"
+        place: dict[str, Any] = dict(textcoords="offset points", ha="right", fontsize=9)
+        place["xycoords"] = ("axes fraction", "data")
+        ax.annotate(text, (0.99, 0), (0, 7 + 12 * row), **place)
+
+
+def _deviations(means: Sequence[Sequence[float]]) -> Array:
+    """Standard deviations over fits, as bars `[2, n]`."""
+    return np.stack([[np.std(fits, ddof=1) for fits in means]] * 2)
+
+
+def _intervals(fits: Sequence[Array], middle: Array) -> Array:
+    """95 % intervals over test seeds, as bars `[2, n]` from the means."""
+    low, high = np.array([stats.interval(fit) for fit in fits]).T
+    return np.stack([middle - low, high - middle])
+
+
+def _size_key(style: Style, several: bool, chosen: int | None) -> list[Line2D]:
+    bars = " ± standard deviation over fits" if several else ", 95 % interval over test seeds"
+    key = [Line2D([], [], label=f"{METHOD}, mean{bars}", **drawing.strokes(style))]
+    if several:
+        key.append(Line2D([], [], color=style.colour, label="one fit", **SINGLE))
+    return key if chosen is None else [*key, Line2D([], [], label="k of Table 1", **CHOSEN)]
+
+
+def _shifts(count: int, most: float = 0.12) -> Array:
     """Where in its bin each of `count` methods stands, so that bars do not hide each other."""
-    return np.linspace(-0.12, 0.12, count) if count > 1 else np.zeros(count)
+    return np.linspace(-most, most, count) if count > 1 else np.zeros(count)
+
+
+def _bars(ax: Axes, x: Array, y: Any, error: Any, style: Style) -> None:
+    """A method's line with a bar at every mark."""
+    ax.errorbar(x, y, error, **drawing.strokes(style), markersize=5, capsize=2)
 
 
 def _bins(ax: Axes, angle: Array, closest: Array, edges: Array, style: Style, shift: float) -> None:
@@ -422,11 +441,4 @@ def _bins(ax: Axes, angle: Array, closest: Array, edges: Array, style: Style, sh
     mean = [g.mean() if g.size else np.nan for g in groups]
     error = [g.std(ddof=1) / np.sqrt(g.size) if g.size > 1 else 0.0 for g in groups]
     x = (edges[:-1] + edges[1:]) / 2 + shift * width
-    ax.errorbar(
-        *(x, mean, error),
-        color=style.colour,
-        linestyle=style.line,
-        marker=style.marker,
-        markersize=5,
-        capsize=2,
-    )
+    _bars(ax, x, mean, error, style)

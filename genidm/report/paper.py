@@ -30,3 +30,6 @@ TABLE1: dict[str, dict[str, tuple[float, float]]] = {
     },
 }
 """Table 1: robot → method → (mean, standard deviation) of the closest distance, in metres."""
+
+METHOD = "LR"
+"""The paper's own method, which is compared with every other."""

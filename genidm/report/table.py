@@ -1,143 +1,44 @@
-"""The table: a method a row, beside the paper's Table 1; as JSON, plain text and Markdown."""
+"""The table of the results beside the paper's Table 1, as plain text and as Markdown."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from genidm import stats
-from genidm.episodes import Episodes
 from genidm.report.paper import TABLE1
 
 HEADER = (
     *("method", "mean ± std", "95 % interval", "IQM", "≤0.25 m", "≤0.5 m", "≤1 m"),
-    *("falls", "collections", "interactions", "paper"),
+    *("falls", "over seeds", "interactions", "paper"),
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """What a method did in the test, and what it took to get there.
-
-    Attributes:
-      method: its name; Table 1's for a method of the paper (RS, RL, GE, LR, ...).
-      episodes: the test, arrays `[seeds, episodes]`.
-      interactions: control steps of the robot while collecting, counted once.
-      replayed: control steps replayed by 𝒢 (Def. 4).
-      settings: how it was collected and fitted; anything that JSON can hold.
-      collecting_seeds: the test of the same method on each of several collected experiences,
-        the first being `episodes`; empty where there is one.
-    """
-
-    method: str
-    episodes: Episodes
-    interactions: int
-    replayed: int
-    settings: dict[str, Any]
-    collecting_seeds: tuple[Episodes, ...] = ()
-
-
-def results(
-    rows: Sequence[Row],
-    *,
-    robot: str,
-    scale: str,
-    scenarios: str,
-    environment: Mapping[str, Any],
-) -> dict[str, Any]:
-    """The rows as one JSON document, methods in the order given; distances in metres.
-
-    Args:
-      rows: one a method; neighbours are also compared on the same scenarios.
-      robot: its name, as in Table 1.
-      scale: "quick", "paper" or a number of interactions.
-      scenarios: sha256 of the scenario bank.
-      environment: "versions" (package → version) and "hardware" (a sentence).
-
-    Returns:
-      robot, scale, scenarios, versions, hardware; methods: name → `stats.summary` with
-      interactions, replayed, settings and, for several collecting seeds, their
-      `stats.spread`; paired: "LR-GE" → `stats.paired` of LR against GE, the row before it.
-      A number that does not exist is null.
-
-    Raises:
-      ValueError: a method stands in two rows, or two rows saw different scenarios.
-    """
-    names = [row.method for row in rows]
-    if len(set(names)) != len(names):
-        raise ValueError(f"a method stands in two rows: {names}")
-    return {
-        "robot": robot,
-        "scale": scale,
-        "scenarios": scenarios,
-        "versions": _plain(environment["versions"]),
-        "hardware": environment["hardware"],
-        "methods": {row.method: _method(row) for row in rows},
-        "paired": {f"{b.method}-{a.method}": _pair(b, a) for a, b in itertools.pairwise(rows)},
-    }
+COMPARED = (
+    *("pair", "difference, m", "95 % interval", "nearer in"),
+    *("over seeds", "95 % interval", "nearer in"),
+)
+BRIEF = 4  # columns of the comparisons where there is one training seed
 
 
 def text(results: Mapping[str, Any]) -> str:
-    """The table for a terminal, aligned, beside the paper's numbers."""
-    cells = _cells(results)
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = [_aligned(row, widths) for row in cells]
-    rule = "─" * max(map(len, lines))
+    """The table for a terminal, aligned, beside the paper's numbers; then the comparisons."""
+    body = _aligned(_cells(results))
+    rule = "─" * max(map(len, body))
     notes = itertools.chain(*(textwrap.wrap(note, 110) for note in _notes(results)))
-    return "\n".join([_caption(results), "", lines[0], rule, *lines[1:], rule, *notes])
+    lines = [_caption(results), "", body[0], rule, *body[1:], rule, *notes]
+    compared = _comparisons(results)
+    legend = textwrap.wrap(_legend(compared), 110)
+    return "\n".join([*lines, "", *legend, "", *_aligned(compared)] if compared else lines)
 
 
 def markdown(results: Mapping[str, Any]) -> str:
-    """The table for a README, beside the paper's numbers."""
-    header, *rows = ("| " + " | ".join(row) + " |" for row in _cells(results))
-    rule = "|:--" + "|--:" * (len(HEADER) - 1) + "|"
+    """The table for a README, beside the paper's numbers; then the comparisons."""
     notes = [f"- {note}" for note in _notes(results)]
-    return "\n".join([_caption(results), "", header, rule, *rows, "", *notes])
-
-
-def _method(row: Row) -> dict[str, Any]:
-    record = {
-        "interactions": int(row.interactions),
-        "replayed": int(row.replayed),
-        **_plain(stats.summary(row.episodes), digits=6),
-        "settings": _plain(row.settings),
-    }
-    if len(row.collecting_seeds) > 1:
-        record["collecting_seeds"] = _plain(stats.spread(row.collecting_seeds), digits=6)
-    return record
-
-
-def _pair(a: Row, b: Row) -> dict[str, Any]:
-    record = stats.paired(a.episodes, b.episodes)
-    if len(a.collecting_seeds) == len(b.collecting_seeds) > 1:
-        record["collecting_seeds"] = stats.paired_spread(a.collecting_seeds, b.collecting_seeds)
-    plain: dict[str, Any] = _plain(record, digits=6)
-    return plain
-
-
-def _plain(value: Any, digits: int | None = None) -> Any:
-    """What JSON can hold: NumPy's numbers as Python's, NaN and infinity as null."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v, digits) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v, digits) for v in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist(), digits)
-    if isinstance(value, float):
-        return _number(value, digits)
-    return value if value is None or isinstance(value, str | int) else str(value)
-
-
-def _number(value: float, digits: int | None) -> float | None:
-    if not math.isfinite(value):
-        return None
-    return value if digits is None else round(value, digits)
+    lines = [_caption(results), "", *_piped(_cells(results)), "", *notes]
+    compared = _comparisons(results)
+    legend = _legend(compared)
+    return "\n".join([*lines, "", legend, "", *_piped(compared)] if compared else lines)
 
 
 def _cells(results: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -163,10 +64,20 @@ def _row(name: str, m: Mapping[str, Any], paper: tuple[float, float] | None) -> 
     )
 
 
-def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
-    name, *numbers = row
-    cells = [f"{n:>{w}}" for n, w in zip(numbers, widths[1:], strict=True)]
-    return "  ".join([f"{name:<{widths[0]}}", *cells]).rstrip()
+def _aligned(cells: Sequence[tuple[str, ...]]) -> list[str]:
+    """Lines in columns of one width, the first to the left and the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for name, *rest in cells:
+        numbers = (f"{n:>{w}}" for n, w in zip(rest, widths[1:], strict=True))
+        lines.append("  ".join([f"{name:<{widths[0]}}", *numbers]).rstrip())
+    return lines
+
+
+def _piped(cells: Sequence[tuple[str, ...]]) -> list[str]:
+    """The same in Markdown."""
+    header, *rows = ("| " + " | ".join(row) + " |" for row in cells)
+    return [header, "|:--" + "|--:" * (len(cells[0]) - 1) + "|", *rows]
 
 
 def _caption(results: Mapping[str, Any]) -> str:
@@ -178,27 +89,80 @@ def _caption(results: Mapping[str, Any]) -> str:
 
 def _notes(results: Mapping[str, Any]) -> list[str]:
     methods = results["methods"]
-    counts = {len(m["collecting_seeds"]["means"]) for m in methods.values() if _several(m)}
-    notes = ["Interactions + replayed steps; the interval is a bootstrap over test seeds."]
-    if counts:
-        number = "–".join(str(n) for n in sorted(counts))
-        notes.append(f"Collections: mean ± std of the means over {number} collecting seeds.")
+    notes = [
+        "Interactions + replayed steps.",
+        f"All but “over seeds” is of {_one_seed(methods)}: the mean and standard deviation over "
+        "all its test episodes; the interval is a bootstrap over its test seeds.",
+    ]
+    several = {name: m["collecting_seeds"] for name, m in methods.items() if _several(m)}
+    if several:
+        notes.append(_over_seeds(several))
+    turned = [f"{name} {m['invariance']:.2g}" for name, m in methods.items() if "invariance" in m]
+    if turned:
+        notes.append(
+            "Mean change of the action when robot and goal are turned alike by up to 180° "
+            f"(Def. 3): {', '.join(turned)}."
+        )
     lost = [f"{name} {100 * m['diverged']:.2f} %" for name, m in methods.items() if m["diverged"]]
     if lost:
         notes.append(f"Diverged, and so in no mean: {', '.join(lost)}.")
-    return notes + [_comparison(name, pair) for name, pair in results["paired"].items()]
+    return notes
+
+
+def _one_seed(methods: Mapping[str, Any]) -> str:
+    """Which training seed the rows are of."""
+    seeds = {name: m["training_seed"] for name, m in methods.items() if "training_seed" in m}
+    if len(set(seeds.values())) == 1:
+        return f"training seed {next(iter(seeds.values()))}"
+    named = ", ".join(f"{name} {seed}" for name, seed in seeds.items())
+    return f"one training seed ({named})" if named else "one training seed"
+
+
+def _over_seeds(several: Mapping[str, Any]) -> str:
+    """What the column over training seeds holds, and the intervals that it has no room for."""
+    numbers = sorted({len(over["means"]) for over in several.values()})
+    sizes = {f"{s} × {e}" for over in several.values() for s, e in over["episodes"][1:]}
+    after = f", after the first tested on {sizes.pop()} episodes" if len(sizes) == 1 else ""
+    text = f"“Over seeds” is of {'–'.join(map(str, numbers))} training seeds, each learned anew"
+    text += f"{after}: the mean and standard deviation of the means of their tests."
+    bounds = {name: over["ci95"] for name, over in several.items() if over["ci95"][0] is not None}
+    named = ", ".join(f"{n} {_metres(low)}–{_metres(high)}" for n, (low, high) in bounds.items())
+    of_three = " (of three: the least and the greatest)" if 3 in numbers else ""
+    return f"{text} 95 % by bootstrap{of_three}: {named}." if named else text
 
 
 def _several(method: Mapping[str, Any]) -> bool:
     return "collecting_seeds" in method
 
 
-def _comparison(name: str, pair: Mapping[str, Any]) -> str:
-    low, high = pair["ci95"]
-    line = f"{name}, same scenarios: {_signed(pair['difference'])} m"
-    line += f" [{_signed(low)}, {_signed(high)}], nearer in {_percent(pair['improvement'])}"
-    over = pair.get("collecting_seeds")
-    return line + (f"; {_spread(over, '+')} over {len(over['means'])} collections" if over else "")
+def _comparisons(results: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The paired differences as a table of their own; with training seeds, where there are."""
+    rows = [_comparison(name, pair) for name, pair in results["paired"].items()]
+    over = any(_several(pair) for pair in results["paired"].values())
+    return [row if over else row[:BRIEF] for row in (COMPARED, *rows)] if rows else []
+
+
+def _legend(compared: Sequence[tuple[str, ...]]) -> str:
+    """What the numbers of the comparisons are over."""
+    text = "On the same scenarios, negative where the first is nearer: with one training seed,"
+    text += " over its test seeds"
+    several = any(len(row) > BRIEF for row in compared)
+    return f"{text}; then over the training seeds." if several else f"{text}."
+
+
+def _comparison(name: str, pair: Mapping[str, Any]) -> tuple[str, ...]:
+    this = (name, _signed(pair["difference"]), _bounds(pair["ci95"]), _percent(pair["improvement"]))
+    if not _several(pair):
+        return (*this, *[""] * (len(COMPARED) - BRIEF))
+    over = pair["collecting_seeds"]
+    count = sum(mean is not None for mean in over["means"])
+    nearer = f"{round(2 * count * over['improvement']) / 2:g} of {count}" if count else "–"
+    return (*this, _spread(over, "+"), _bounds(over["ci95"]), nearer)
+
+
+def _bounds(ci95: Sequence[float | None]) -> str:
+    low, high = ci95
+    return "–" if low is None or high is None else f"[{low:+.3f}, {high:+.3f}]"
 
 
 def _metres(value: float | None) -> str:

@@ -1,0 +1,145 @@
+"""Table 1, all of it: `python -m experiments.table1 --robot ant`."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from genidm.cells import Cell
+from genidm.errors import BadInput
+from genidm.experiment import Options, bank_of, cell, guarded, write_report
+from genidm.methods import EXTRA, ORDER, Direct, Inverse, by_name
+from genidm.robots import Robot
+from genidm.robots import by_name as robot_by_name
+from genidm.scenarios import Scenarios
+
+Methods = Sequence[Direct | Inverse]
+
+
+@dataclasses.dataclass(frozen=True)
+class Table(Options):
+    """What the whole table takes.
+
+    Attributes:
+      robot: by its name.
+      methods: the rows to make; what lies under `out` already stands in the table, too.
+      extra: also the rows that the paper does not have (HF); off, they are left out.
+      seeds: how many training seeds, from `seed` on. The first makes the rows; the spread
+        over all of them stands beside.
+      spread_episodes: test episodes a test seed with the later training seeds.
+    """
+
+    robot: str = "ant"
+    methods: tuple[str, ...] = ORDER
+    extra: bool = True
+    seeds: int = 1
+    spread_episodes: int = 200
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1 or self.spread_episodes < 1:
+            raise BadInput("a table needs seeds and spread_episodes of at least 1")
+
+
+def chosen(options: Table) -> list[Direct | Inverse]:
+    """The methods that a user named.
+
+    Raises:
+      BadInput: there is no such method, or none is left.
+    """
+    rows = [by_name(name) for name in dict.fromkeys(options.methods)]
+    rows = rows if options.extra else [row for row in rows if row not in EXTRA]
+    if not rows:
+        raise BadInput(f"no method to run; there are: {', '.join(ORDER)}")
+    return rows
+
+
+def grouped(methods: Methods) -> list[Direct | Inverse]:
+    """Methods that learn from one agent's experience together: it is collected by the first."""
+    sources = [(method.agent, method.task) for method in methods]
+    return sorted(methods, key=lambda method: sources.index((method.agent, method.task)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """A cell to run, and what it is tested on."""
+
+    cell: Cell[Any]
+    bank: Scenarios
+
+    def __str__(self) -> str:
+        return f"{self.cell.method.name}, training seed {self.cell.seed}"
+
+
+def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
+    """The cells of the table, seed by seed; the later ones on the beginning of the bank."""
+    numbers = range(options.seed, options.seed + options.seeds)
+    seeds = [dataclasses.replace(options, seed=seed) for seed in numbers]
+    first, *later = ([cell(robot, m, these) for m in grouped(methods)] for these in seeds)
+    bank = few = bank_of(first[0], options)
+    if later and options.spread_episodes < bank.shape[1]:
+        few = bank_of(first[0], dataclasses.replace(options, episodes=options.spread_episodes))
+    rest = itertools.chain(*later)
+    return [*(Work(this, bank) for this in first), *(Work(this, few) for this in rest)]
+
+
+def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, list[Exception]]:
+    """Runs every cell that is not done, then writes one table of all.
+
+    A cell that fails does not keep the others from running.
+
+    Args:
+      robot: whose table it is.
+      methods: its rows, in any order.
+      options: scale, seeds, places.
+
+    Returns:
+      the directory of the report, or None where no cell on the table's own scenarios ended;
+      and what the cells that did not end failed with.
+
+    Raises:
+      BadInput: an option cannot be; nothing has been run then.
+    """
+    todo = work(robot, methods, options)
+    failures, ended, first = list[Exception](), False, todo[0]
+    for number, item in enumerate(todo, 1):
+        print(f"{item} ({number} of {len(todo)})", file=sys.stderr)
+        error = attempt(item)
+        if error:
+            failures.append(error)
+        ended |= error is None and item.bank is first.bank
+    return write_report(first.cell, first.bank, options) if ended else None, failures
+
+
+def attempt(item: Work) -> Exception | None:
+    """Runs a cell to its end; what it failed with, once that is said on stderr."""
+    try:
+        item.cell.episodes(item.bank)
+    except BadInput as error:
+        print(f"error: {item}: {error}", file=sys.stderr)
+        return error
+    except Exception as error:  # of whatever kind: the other cells do not depend on it
+        traceback.print_exc()
+        print(f"error: {item} failed", file=sys.stderr)
+        return error
+    return None
+
+
+def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
+    """Runs the cells and prints the table; a cell that failed shows in the exit status."""
+    report, failures = run(robot_by_name(options.robot), chosen(options), options)
+    if report:
+        print((report / "table.txt").read_text())
+    if failures:
+        print(f"error: {len(failures)} cells did not end; see above", file=sys.stderr)
+        sys.exit(2 if all(isinstance(error, BadInput) for error in failures) else 1)
+
+
+if __name__ == "__main__":
+    guarded(table1, "Table 1: every method on one robot, and the spread over training seeds.")

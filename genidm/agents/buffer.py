@@ -1,0 +1,155 @@
+"""A replay buffer that knows episodes: a ring of steps on one device, lane by lane.
+
+Rows are steps of all lanes, in the order they happened, so what follows a step in its
+episode lies below it in the same column.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from genidm.errors import BadInput
+from genidm.robots.base import Robot
+from genidm.tasks import Step
+
+
+class Memory(flax.struct.PyTreeNode):
+    """What is remembered of steps `[...]`; the state after one is s of the next row.
+
+    Attributes:
+      s: `[..., S]`, before the step.
+      o: `[..., 3]`, position before it, metres, world frame.
+      o_next: `[..., 3]`, position after it, before any reset.
+      a: `[..., A]`.
+      goal: `[..., 3]`, metres, world frame; None where the task has none.
+      cost: control and contact costs.
+      fallen: bool, the robot fell, or its physics diverged.
+      reward: see `Step`.
+      rest: see `Step`.
+      terminal: see `Step`.
+      last: see `Step`.
+      age: see `Step`.
+    """
+
+    s: Any
+    o: Any
+    o_next: Any
+    a: Any
+    goal: Any
+    cost: Any
+    fallen: Any
+    reward: Any
+    rest: Any
+    terminal: Any
+    last: Any
+    age: Any
+
+
+def remember(robot: Robot, step: Step) -> Memory:
+    """The memory of one transition of B lanes, `[B, ...]`."""
+    return Memory(
+        s=step.before.observation,
+        o=step.before.position,
+        o_next=step.after.position,
+        a=step.action,
+        goal=step.goal,
+        cost=robot.cost(step.after, step.action),
+        fallen=step.after.fallen | step.after.diverged,
+        reward=step.reward,
+        rest=step.rest,
+        terminal=step.terminal,
+        last=step.last,
+        age=step.age,
+    )
+
+
+class Buffer(flax.struct.PyTreeNode):
+    """The newest T steps of B lanes.
+
+    Attributes:
+      rows: Memory `[T, B, ...]`, a ring: row n of all that were written lies at n mod T.
+      written: int32, rows since the start.
+    """
+
+    rows: Memory
+    written: jax.Array
+
+    @property
+    def filled(self) -> jax.Array:
+        """Rows that hold something."""
+        return jnp.minimum(self.written, self.rows.last.shape[0])
+
+    @property
+    def oldest(self) -> jax.Array:
+        """Where the oldest row lies."""
+        return (self.written - self.filled) % self.rows.last.shape[0]
+
+
+class Index(NamedTuple):
+    """Steps in a buffer: `row [N]` and `lane [N]`, int32."""
+
+    row: jax.Array
+    lane: jax.Array
+
+
+def empty(part: Memory, capacity: int) -> Buffer:
+    """A buffer for parts like this one.
+
+    Args:
+      part: Memory `[U, B, ...]`, or its shapes.
+      capacity: steps, over all lanes; rounded down to whole parts.
+
+    Raises:
+      BadInput: not even two parts fit.
+    """
+    unroll, lanes = part.last.shape
+    rows = capacity // (unroll * lanes) * unroll
+    if rows < 2 * unroll:
+        raise BadInput(f"a buffer for {capacity} steps holds no two iterations of {unroll * lanes}")
+    blank = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), part)
+    return Buffer(blank, jnp.zeros((), jnp.int32))
+
+
+def insert(buffer: Buffer, part: Memory) -> Buffer:
+    """The buffer with a part `[U, B, ...]` in the place of its oldest rows; U divides T."""
+    row = buffer.written % buffer.rows.last.shape[0]
+
+    def write(ring: jax.Array, new: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_update_slice_in_dim(ring, new, row, axis=0)
+
+    rows = jax.tree.map(write, buffer.rows, part)
+    return Buffer(rows, buffer.written + part.last.shape[0])
+
+
+def steps_left(buffer: Buffer) -> jax.Array:
+    """Steps `[T, B]` int32 that follow each one in its episode, as far as it is remembered."""
+    rows = buffer.rows.last.shape[0]
+    last = jnp.roll(buffer.rows.last, -buffer.oldest, axis=0)
+    time = jnp.arange(rows, dtype=jnp.int32)[:, None]
+    ends = jnp.where(last | (time == buffer.filled - 1), time, rows)
+    end = jax.lax.cummin(ends, axis=0, reverse=True)
+    return jnp.roll(end - time, buffer.oldest, axis=0)
+
+
+def draw(buffer: Buffer, key: jax.Array, size: int) -> Index:
+    """Steps drawn evenly from all but the newest row, which nothing follows yet."""
+    rows, lanes = buffer.rows.last.shape
+    which, where = jax.random.split(key)
+    row = jax.random.randint(which, (size,), 0, buffer.filled - 1)
+    return Index((buffer.oldest + row) % rows, jax.random.randint(where, (size,), 0, lanes))
+
+
+def look_up(buffer: Buffer, at: Index) -> tuple[Memory, jax.Array]:
+    """The steps `[N, ...]` at an index, and the states `[N, S]` in the rows after them.
+
+    Where a step is the last of its episode, the row after it is the start of another.
+    """
+    rows = buffer.rows.last.shape[0]
+    return (
+        jax.tree.map(lambda x: x[at.row, at.lane], buffer.rows),
+        buffer.rows.s[(at.row + 1) % rows, at.lane],
+    )

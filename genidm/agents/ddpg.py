@@ -1,0 +1,143 @@
+"""DDPG (Lillicrap et al. 2016), on Brax's networks."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.gradients import gradient_update_fn
+from brax.training.networks import FeedForwardNetwork, make_policy_network, make_q_network
+from brax.training.types import Transition
+
+from genidm.agents.base import Metrics
+from genidm.agents.off_policy import Brain, Learner, OffPolicy
+from genidm.agents.policy import Policy, normalize
+from genidm.robots.base import Robot
+from genidm.tasks import Task
+
+
+class Networks(flax.struct.PyTreeNode):
+    """Parameters of policy and critic, their targets, and the optimizers."""
+
+    policy: Any
+    critic: Any
+    policy_target: Any
+    critic_target: Any
+    policy_optimizer: Any
+    critic_optimizer: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPG(OffPolicy):
+    """Settings of DDPG.
+
+    Attributes:
+      noise: standard deviation of what is added to actions while exploring.
+      random: share of exploring actions that are drawn evenly instead.
+      action_cost: weight of the mean square of the actions before tanh in the policy's
+        loss, which keeps them out of tanh's flat ends.
+    """
+
+    noise: float = 0.1
+    random: float = 0.1
+    action_cost: float = 0.01
+
+    def networks(self, robot: Robot, size: int) -> tuple[FeedForwardNetwork, FeedForwardNetwork]:
+        """Brax's policy (before tanh) and critic, on normalised inputs."""
+        actions = robot.action.size
+        return (
+            make_policy_network(actions, size, normalize, self.hidden),
+            make_q_network(size, actions, normalize, self.critic_hidden, n_critics=1),
+        )
+
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
+        mind = learner.mind
+        return Policy(
+            params=mind.brain.policy, mean=mind.statistics.mean, std=mind.statistics.std,
+            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
+        )  # fmt: skip
+
+    def loss_critic(
+        self,
+        critic: Any,
+        networks: tuple[FeedForwardNetwork, FeedForwardNetwork],
+        targets: tuple[Any, Any],
+        statistics: RunningStatisticsState,
+        batch: Transition,
+    ) -> jax.Array:
+        """Half the mean square of Q(x, a) − (r + γ Q'(x', μ'(x'))); truncated steps count 0."""
+        mu, q = networks
+        action = jnp.tanh(mu.apply(statistics, targets[0], batch.next_observation))
+        following = q.apply(statistics, targets[1], batch.next_observation, action)[..., 0]
+        reward = self.reward_scale * batch.reward
+        target = reward + self.discount * batch.discount * following
+        here = q.apply(statistics, critic, batch.observation, batch.action)[..., 0]
+        kept = 1 - batch.extras["state_extras"]["truncation"]
+        return 0.5 * jnp.mean((kept * (here - target)) ** 2)
+
+    def loss_policy(
+        self,
+        policy: Any,
+        networks: tuple[FeedForwardNetwork, FeedForwardNetwork],
+        critic: Any,
+        statistics: RunningStatisticsState,
+        batch: Transition,
+    ) -> jax.Array:
+        """−Q(x, μ(x)), batch mean, and the actions' cost."""
+        mu, q = networks
+        raw = mu.apply(statistics, policy, batch.observation)
+        value = q.apply(statistics, critic, batch.observation, jnp.tanh(raw))
+        return self.action_cost * jnp.mean(raw**2) - jnp.mean(value)
+
+    def brain(self, robot: Robot, size: int) -> Brain:
+        networks = self.networks(robot, size)
+        adam = optax.adam(self.learning_rate)
+
+        def loss_critic(params: Any, *rest: Any) -> jax.Array:
+            return self.loss_critic(params, networks, *rest)
+
+        def loss_policy(params: Any, *rest: Any) -> jax.Array:
+            return self.loss_policy(params, networks, *rest)
+
+        critic_update = gradient_update_fn(loss_critic, adam, pmap_axis_name=None)
+        policy_update = gradient_update_fn(loss_policy, adam, pmap_axis_name=None)
+
+        def start(key: jax.Array) -> Networks:
+            keys = jax.random.split(key)
+            params = [net.init(k) for net, k in zip(networks, keys, strict=True)]
+            # Targets are copies: one buffer cannot be donated twice.
+            targets = jax.tree.map(jnp.copy, params)
+            return Networks(*params, *targets, *(adam.init(p) for p in params))
+
+        def act(
+            statistics: RunningStatisticsState, policy: Any, x: jax.Array, key: jax.Array
+        ) -> jax.Array:
+            which, noise, anywhere = jax.random.split(key, 3)
+            action = jnp.tanh(networks[0].apply(statistics, policy, x))
+            action = action + self.noise * jax.random.normal(noise, action.shape)
+            drawn = jax.random.uniform(anywhere, action.shape, minval=-1.0)
+            explores = jax.random.uniform(which) < self.random
+            return jnp.where(explores, drawn, jnp.clip(action, -1.0, 1.0))
+
+        def update(
+            n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
+        ) -> tuple[Networks, Metrics]:
+            critic_loss, critic, critic_state = critic_update(
+                n.critic, (n.policy_target, n.critic_target), statistics, batch,
+                optimizer_state=n.critic_optimizer,
+            )  # fmt: skip
+            policy_loss, policy, policy_state = policy_update(
+                n.policy, critic, statistics, batch, optimizer_state=n.policy_optimizer
+            )
+            policy_target, critic_target = optax.incremental_update(
+                (policy, critic), (n.policy_target, n.critic_target), self.tau
+            )
+            new = Networks(policy, critic, policy_target, critic_target, policy_state, critic_state)
+            return new, {"critic_loss": critic_loss, "policy_loss": policy_loss}
+
+        return Brain(start, lambda n: n.policy, act, update)

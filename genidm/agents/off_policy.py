@@ -1,0 +1,246 @@
+"""The loop that SAC and DDPG share: step, remember, learn from a replay buffer.
+
+An iteration is two programs, as PPO's: in the first every device steps its own lanes; in
+the second the buffer takes the steps in and `updates` minibatches are learned from, on one
+device. What differs between learners is a `Brain`.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.types import Transition
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.buffer import (
+    Buffer,
+    Memory,
+    draw,
+    empty,
+    insert,
+    look_up,
+    remember,
+    steps_left,
+)  # fmt: skip
+from genidm.agents.her import HER
+from genidm.agents.policy import Policy, no_statistics
+from genidm.errors import BadInput
+from genidm.experience import Experience, record
+from genidm.progress import compiled
+from genidm.robots.base import Robot
+from genidm.tasks import GoToGoal, Lanes, Task, Verdict, input_size, inputs, outlook, split
+
+
+class Brain(NamedTuple):
+    """What a learner is made of.
+
+    Attributes:
+      start: key → networks and their optimizers, a tree.
+      policy: that tree → the part that acts.
+      act: (statistics, acting part, inputs `[I]`, key) → action `[A]`, with exploration.
+      update: (tree, statistics, Transition `[N, ...]`, key) → (tree, losses).
+    """
+
+    start: Callable[[jax.Array], Any]
+    policy: Callable[[Any], Any]
+    act: Callable[[RunningStatisticsState, Any, jax.Array, jax.Array], jax.Array]
+    update: Callable[..., tuple[Any, Metrics]]
+
+
+class Mind(flax.struct.PyTreeNode):
+    """What learns: the brain's tree, statistics of the inputs, the buffer, a key."""
+
+    brain: Any
+    statistics: RunningStatisticsState
+    buffer: Buffer
+    key: jax.Array
+
+
+class Learner(flax.struct.PyTreeNode):
+    """All that is carried from one iteration to the next."""
+
+    lanes: Lanes
+    mind: Mind
+
+
+@dataclasses.dataclass(frozen=True)
+class OffPolicy(abc.ABC):
+    """Settings that off-policy learners share.
+
+    Attributes:
+      lanes: robots at once.
+      unroll: steps an iteration.
+      updates: minibatches an iteration.
+      batch: steps a minibatch.
+      capacity: steps that the buffer holds.
+      warmup: steps before the first update.
+      learning_rate: of Adam.
+      discount: of rewards, a step.
+      tau: share of the networks in their targets, an update.
+      reward_scale: rewards are multiplied by it.
+      hidden: layers of the policy (Table 2: 64×64).
+      critic_hidden: layers of the critics.
+      her: relabelling; None learns from the task's own goals and rewards.
+    """
+
+    lanes: int = 128
+    unroll: int = 8
+    updates: int = 128
+    batch: int = 256
+    capacity: int = 1_000_000
+    warmup: int = 10_000
+    learning_rate: float = 1e-3
+    discount: float = 0.98
+    tau: float = 0.005
+    reward_scale: float = 1.0
+    hidden: tuple[int, ...] = (64, 64)
+    critic_hidden: tuple[int, ...] = (256, 256)
+    her: HER | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.lanes, self.unroll, self.updates, self.batch) < 1:
+            raise BadInput("lanes, unroll, updates and batch must be at least 1")
+        if not 0 < self.discount < 1:
+            raise BadInput(f"discount must lie in (0, 1), not at {self.discount}")
+        size = self.lanes * self.unroll
+        if self.warmup > self.capacity // size * size:
+            room = f"a buffer for {self.capacity} steps"
+            raise BadInput(f"{room} never holds the {self.warmup} of the warmup")
+
+    @abc.abstractmethod
+    def brain(self, robot: Robot, size: int) -> Brain:
+        """The learner's networks and losses, for inputs of this size."""
+
+    @abc.abstractmethod
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
+        """The policy of a learner, without exploration."""
+
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        if self.her and not isinstance(task, GoToGoal):
+            raise BadInput("HER relabels goals, and this task has none")
+        brain = self.brain(robot, input_size(robot, task))
+        walk = functools.partial(_walk, robot, task, brain, self.unroll)
+        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
+        learn = functools.partial(self._learn, robot, task, brain)
+
+        def start(key: jax.Array) -> Learner:
+            lanes_key, networks, stream = jax.random.split(key, 3)
+            lanes = task.start(robot, jax.random.split(lanes_key, self.lanes))
+            mind = brain.start(networks)
+            statistics = no_statistics(input_size(robot, task))
+            part = jax.eval_shape(walk, statistics, brain.policy(mind), lanes)[2]
+            return Learner(lanes, Mind(mind, statistics, empty(part, self.capacity), stream))
+
+        def place(learner: Learner) -> Learner:
+            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.mind, mesh))
+
+        def acting(mind: Mind) -> Any:
+            return devices.put((mind.statistics, brain.policy(mind.brain)), mesh, None)
+
+        def prepare(learner: Learner) -> Iterate:
+            args = (*acting(learner.mind), learner.lanes)
+            step = compiled(f"{self.title}'s stepping", jax.jit(sharded, donate_argnums=2), *args)
+            part = jax.eval_shape(sharded, *args)[2]
+            update = compiled(
+                f"{self.title}'s learning", jax.jit(learn, donate_argnums=0), learner.mind, part
+            )
+
+            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
+                lanes, experience, part, seen = step(*acting(learner.mind), learner.lanes)
+                mind, losses = update(learner.mind, devices.gather(part, mesh))
+                return Learner(lanes, mind), experience, seen | losses
+
+            return iterate
+
+        return Learning(start, place, prepare)
+
+    @property
+    def title(self) -> str:
+        """What the learner is called in messages."""
+        return type(self).__name__
+
+    def _learn(
+        self, robot: Robot, task: Task, brain: Brain, mind: Mind, part: Memory
+    ) -> tuple[Mind, Metrics]:
+        """Takes `part [unroll, lanes, ...]` in, and learns from `updates` minibatches."""
+        buffer = insert(mind.buffer, part)
+        fed = inputs(part.s, None if part.goal is None else part.goal - part.o)
+        statistics = running_statistics.update(mind.statistics, fed)
+        left = steps_left(buffer)
+
+        def update(tree: Any, key: jax.Array) -> tuple[Any, Metrics]:
+            which, how = jax.random.split(key)
+            batch = self.sample(robot, task, buffer, left, which)
+            return brain.update(tree, statistics, batch, how)
+
+        def learn(tree: Any, keys: jax.Array) -> tuple[Any, Metrics]:
+            tree, info = jax.lax.scan(update, tree, keys)
+            return tree, jax.tree.map(jnp.mean, info)
+
+        def wait(tree: Any, keys: jax.Array) -> tuple[Any, Metrics]:
+            info = jax.eval_shape(learn, tree, keys)[1]
+            return tree, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), info)
+
+        key, stream = jax.random.split(mind.key)
+        ready = buffer.filled * self.lanes >= max(self.warmup, 2 * self.lanes)
+        keys = jax.random.split(stream, self.updates)
+        tree, info = jax.lax.cond(ready, learn, wait, mind.brain, keys)
+        return Mind(tree, statistics, buffer, key), info
+
+    def sample(
+        self, robot: Robot, task: Task, buffer: Buffer, left: jax.Array, key: jax.Array
+    ) -> Transition:
+        """A minibatch `[batch, ...]`, its goals relabelled if there is HER, and judged anew.
+
+        A step at the time limit is no end: it is marked as truncated, and not learned from.
+        """
+        where, what = jax.random.split(key)
+        at = draw(buffer, where, self.batch)
+        rows, s_next = look_up(buffer, at)
+        goal, verdict = rows.goal, Verdict(rows.reward, rows.terminal, rows.rest)
+        if self.her:
+            assert isinstance(task, GoToGoal)  # `learning` has refused the others
+            goal = self.her.goal(buffer, left, at, what, robot.standing_height)
+            verdict = task.judge(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
+        before, after = (None, None) if goal is None else (goal - rows.o, goal - rows.o_next)
+        return Transition(
+            observation=inputs(rows.s, before),
+            action=rows.a,
+            reward=outlook(verdict, self.discount),
+            discount=1.0 - verdict.terminal,
+            next_observation=inputs(s_next, after),
+            extras={"state_extras": {"truncation": 1.0 * (rows.last & ~verdict.terminal)}},
+        )
+
+
+def _walk(
+    robot: Robot,
+    task: Task,
+    brain: Brain,
+    unroll: int,
+    statistics: RunningStatisticsState,
+    policy: Any,
+    lanes: Lanes,
+) -> tuple[Lanes, Experience, Memory, Metrics]:
+    """`unroll` steps of every lane, exploring; outputs `[unroll, B, ...]`."""
+
+    def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Memory, Metrics]]:
+        lanes, keys = split(lanes)
+        fed = inputs(lanes.robots.observation, lanes.displacement)
+        action = jax.vmap(brain.act, (None, None, 0, 0))(statistics, policy, fed, keys)
+        lanes, seen = task.advance(robot, lanes, action)
+        return lanes, (record(seen), remember(robot, seen), task.metrics(robot, seen))
+
+    lanes, (experience, part, seen) = jax.lax.scan(step, lanes, length=unroll)
+    return lanes, experience, part, seen

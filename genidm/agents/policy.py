@@ -1,0 +1,95 @@
+"""What an agent has learned, as a controller: (s, g − o) → a, without exploration."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.networks import MLP
+from flax import linen
+
+from genidm import files
+from genidm.robots.base import Robot
+from genidm.tasks import inputs
+
+Activation = Literal["tanh", "relu"]
+ACTIVATIONS: dict[Activation, Callable[[jax.Array], jax.Array]] = {
+    "tanh": linen.tanh,
+    "relu": linen.relu,
+}
+
+# Normalised inputs are kept within ± this, for the networks of all agents.
+normalize = functools.partial(running_statistics.normalize, max_abs_value=10.0)
+
+
+def no_statistics(size: int) -> RunningStatisticsState:
+    """Of no inputs yet; of strong types, as those from a checkpoint: one program serves both."""
+    state = running_statistics.init_state(jnp.zeros(size))
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
+
+
+class Policy(flax.struct.PyTreeNode):
+    """The mean action of a trained policy network, squashed by tanh.
+
+    Attributes:
+      params: of Brax's policy network; its first A outputs are the mean.
+      mean: `[I]`, of the inputs seen while learning.
+      std: `[I]`.
+      hidden: layers of the network.
+      activation: of the hidden layers.
+      directed: fed (s, g − o); s alone otherwise.
+      robot: the robot that it was trained on.
+    """
+
+    params: Any
+    mean: jax.Array
+    std: jax.Array
+    hidden: tuple[int, ...] = flax.struct.field(pytree_node=False)
+    activation: Activation = flax.struct.field(pytree_node=False)
+    directed: bool = flax.struct.field(pytree_node=False)
+    robot: Robot = flax.struct.field(pytree_node=False)
+
+    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+        """Actions `[..., A]` for states `[..., S]` and ways to the goal `[..., 3]`, metres."""
+        x = inputs(s, displacement if self.directed else None)
+        x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
+        outputs = self.params["params"][f"hidden_{len(self.hidden)}"]["bias"].shape[-1]
+        network = MLP((*self.hidden, outputs), ACTIVATIONS[self.activation])
+        out = network.apply(self.params, x)
+        return jnp.tanh(out[..., : self.robot.action.size])
+
+    def save(self, path: Path, overwrite: bool = False) -> None:
+        """Writes the policy as a directory, without pickle.
+
+        Raises:
+          BadInput: there is something already, and `overwrite` is not set.
+        """
+        leaves = jax.tree.map(
+            np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
+        )
+        meta = {
+            "robot": self.robot.name,
+            "hidden": self.hidden,
+            "activation": self.activation,
+            "directed": self.directed,
+        }
+        files.save_arrays(path, leaves, meta, overwrite)
+
+    @classmethod
+    def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Policy:
+        """The policy that `save` wrote, from what lies in its directory."""
+        return cls(
+            **tree,
+            hidden=tuple(meta["hidden"]),
+            activation=meta["activation"],
+            directed=meta["directed"],
+            robot=robot,
+        )

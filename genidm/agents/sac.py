@@ -1,0 +1,107 @@
+"""SAC (Haarnoja et al. 2018), composed from Brax's networks and losses."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.agents.sac.losses import make_losses
+from brax.training.agents.sac.networks import SACNetworks
+from brax.training.distribution import NormalTanhDistribution
+from brax.training.gradients import gradient_update_fn
+from brax.training.networks import make_policy_network, make_q_network
+from brax.training.types import Transition
+
+from genidm.agents.base import Metrics
+from genidm.agents.off_policy import Brain, Learner, OffPolicy
+from genidm.agents.policy import Policy, normalize
+from genidm.robots.base import Robot
+from genidm.tasks import Task
+
+
+class Networks(flax.struct.PyTreeNode):
+    """Parameters of policy, critics, their targets and the temperature, and the optimizers."""
+
+    policy: Any
+    critic: Any
+    target: Any
+    log_alpha: jax.Array
+    policy_optimizer: Any
+    critic_optimizer: Any
+    alpha_optimizer: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class SAC(OffPolicy):
+    """Settings of SAC; the temperature is tuned towards an entropy of −A / 2, as Brax does."""
+
+    def networks(self, robot: Robot, size: int) -> SACNetworks:
+        """Brax's policy and two critics on normalised inputs."""
+        distribution = NormalTanhDistribution(event_size=robot.action.size)
+        return SACNetworks(
+            make_policy_network(distribution.param_size, size, normalize, self.hidden),
+            make_q_network(size, robot.action.size, normalize, self.critic_hidden),
+            distribution,
+        )
+
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
+        mind = learner.mind
+        return Policy(
+            params=mind.brain.policy, mean=mind.statistics.mean, std=mind.statistics.std,
+            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
+        )  # fmt: skip
+
+    def brain(self, robot: Robot, size: int) -> Brain:
+        networks = self.networks(robot, size)
+        adam = optax.adam(self.learning_rate)
+        losses = make_losses(networks, self.reward_scale, self.discount, robot.action.size)
+        alpha_update, critic_update, policy_update = (
+            gradient_update_fn(loss, adam, pmap_axis_name=None) for loss in losses
+        )
+
+        def start(key: jax.Array) -> Networks:
+            policy_key, critic_key = jax.random.split(key)
+            policy = networks.policy_network.init(policy_key)
+            critic = networks.q_network.init(critic_key)
+            log_alpha = jnp.zeros(())
+            # The target is a copy: one buffer cannot be donated twice.
+            target = jax.tree.map(jnp.copy, critic)
+            states = (adam.init(x) for x in (policy, critic, log_alpha))
+            return Networks(policy, critic, target, log_alpha, *states)
+
+        def act(
+            statistics: RunningStatisticsState, policy: Any, x: jax.Array, key: jax.Array
+        ) -> jax.Array:
+            logits = networks.policy_network.apply(statistics, policy, x)
+            return networks.parametric_action_distribution.sample(logits, key)
+
+        def update(
+            n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
+        ) -> tuple[Networks, Metrics]:
+            keys = jax.random.split(key, 3)
+            alpha = jnp.exp(n.log_alpha)
+            _, log_alpha, alpha_state = alpha_update(
+                n.log_alpha, n.policy, statistics, batch, keys[0],
+                optimizer_state=n.alpha_optimizer,
+            )  # fmt: skip
+            critic_loss, critic, critic_state = critic_update(
+                n.critic, n.policy, statistics, n.target, alpha, batch, keys[1],
+                optimizer_state=n.critic_optimizer,
+            )  # fmt: skip
+            policy_loss, policy, policy_state = policy_update(
+                n.policy, statistics, critic, alpha, batch, keys[2],
+                optimizer_state=n.policy_optimizer,
+            )  # fmt: skip
+            target = optax.incremental_update(critic, n.target, self.tau)
+            info = {"critic_loss": critic_loss, "policy_loss": policy_loss, "alpha": alpha}
+            new = Networks(
+                policy, critic, target, log_alpha, policy_state, critic_state, alpha_state
+            )
+            return new, info
+
+        return Brain(start, lambda n: n.policy, act, update)

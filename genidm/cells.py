@@ -1,0 +1,257 @@
+"""The stages of a cell of Table 1, each skipped when it is done.
+
+    experience ──▶ replay (𝒢) ──▶ controller ──▶ test        Inverse methods
+    policy ─────────────────────────────────────▶ test        Direct methods
+
+Every stage has a directory that the settings it depends on name, so methods that agree
+on a stage share it, and a run that was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import jax
+import numpy as np
+
+from genidm import controller, experience, files
+from genidm.agents.policy import Policy
+from genidm.collect import collect, whole
+from genidm.config import plain
+from genidm.episodes import Episodes
+from genidm.evaluate import Steering, Test, episodes, flatten, run
+from genidm.experience import Experience
+from genidm.fit import Fit, fit
+from genidm.generalize import Replay, pairs, replay, residual
+from genidm.methods import Direct, Inverse, Method
+from genidm.robots import Robot
+from genidm.scale import Scale
+from genidm.scenarios import Scenarios, tours
+from genidm.store import Stage
+
+M = TypeVar("M", bound=Method)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell(abc.ABC, Generic[M]):
+    """One method on one robot, with one seed: its stages.
+
+    Attributes:
+      robot: what is steered.
+      method: how.
+      scale: how much of the protocol.
+      seed: of all that is learned; the test's are fixed.
+      root: directory of the stages.
+      test: settings of the test.
+    """
+
+    robot: Robot
+    method: M
+    scale: Scale
+    seed: int
+    root: Path
+    test: Test
+
+    @property
+    @abc.abstractmethod
+    def controller_stage(self) -> Stage:
+        """Where the controller lies, once it is made."""
+
+    @abc.abstractmethod
+    def controller(self) -> Steering:
+        """What steers the robot in the test; made, unless it is there."""
+
+    @property
+    def _label(self) -> str:
+        return f"{self.method.name.replace(' ', '-')}-{self.seed}"
+
+    def _key(self, stage: int) -> jax.Array:
+        return jax.random.fold_in(jax.random.key(self.seed), stage)
+
+    def _learning(self) -> dict[str, Any]:
+        """The config of the stage in which the agent learns."""
+        m = self.method
+        return dict(
+            robot=self.robot.settings, agent=m.agent, task=m.task,
+            interactions=self.scale.interactions, seed=self.seed,
+        )  # fmt: skip
+
+    def _collect(self, stage: Stage, keep: bool = True) -> tuple[Any, Policy | None]:
+        """Lets the agent learn; what it saw, if that is kept, and the policy it ended with."""
+        m = self.method
+        record, learner = collect(
+            self.robot, m.agent, self.scale.interactions, self.seed,
+            task=m.task, stage=stage, keep=keep,
+        )  # fmt: skip
+        return record, m.agent.policy(self.robot, m.task, learner)
+
+    def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
+        """The test (A.1.3), and the ways of Fig. 8; returns the stage that holds them.
+
+        Args:
+          bank: the scenarios.
+          kind: first word of the stage's name. The report shows all of kind "test"; those
+            of another kind are no rows of its table.
+        """
+        config = dict(fit=self.controller_stage.directory.name, bank=bank.digest(), test=self.test)
+        stage = Stage.open(self.root, f"{kind}-{self._label}", config)
+        if not stage.done:
+            model, walks = self.controller(), tours(self.robot)
+            outcome, ways = run(
+                self.robot, model, flatten(walks, bank), self.test,
+                traced=walks.yaw.size, stage=stage,
+            )  # fmt: skip
+            rest = jax.tree.map(lambda x: np.asarray(x)[walks.yaw.size :], outcome)
+            save_test(stage, episodes(rest, bank.shape), ways)
+            stage.finish(
+                self.controller_stage.summary()
+                | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
+                | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
+            )
+            stage.clear_checkpoints()
+        return stage
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseCell(Cell[Inverse]):
+    """A method that fits an inverse dynamics model to experience.
+
+    Attributes:
+      repeat: which of several independent fits to the same pairs; 0 is the method's own.
+    """
+
+    repeat: int = 0
+
+    @functools.cached_property
+    def experience_stage(self) -> Stage:
+        """Where the record lies; shared by all methods with the same agent."""
+        agent = type(self.method.agent).__name__
+        return Stage.open(self.root, f"experience-{agent}-{self.seed}", self._learning())
+
+    def experience(self) -> Experience:
+        """What the agent saw while it learned (§4.1)."""
+        stage = self.experience_stage
+        if not stage.done:
+            record, policy = self._collect(stage)
+            if policy:
+                policy.save(stage.path("policy"), overwrite=True)
+            stage.finish({"interactions": record.interactions})
+            return record
+        return experience.load_chunks(stage.path("experience"), self.robot)
+
+    @functools.cached_property
+    def replay_stage(self) -> Stage | None:
+        """Where 𝒢(E) lies; None for a method that learns from the record alone."""
+        m = self.method
+        if m.generalize is None:
+            return None
+        config = dict(
+            experience=self.experience_stage.directory.name, share=m.share, generalize=m.generalize
+        )
+        return Stage.open(self.root, f"replay-{m.generalize.mode}-{self.seed}", config)
+
+    def replay(self, record: Experience) -> Replay | None:
+        """𝒢(E) (Def. 4) of the part of the record that the method learns from."""
+        stage = self.replay_stage
+        if stage is None:
+            return None
+        if not stage.done:
+            turned = replay(self.robot, record, self._key(1), self.method.generalize)
+            turned.save(stage.path("replay"))
+            files.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
+            stage.finish({"replayed": turned.yaw.size})
+        return Replay.load(stage.path("replay"))
+
+    @functools.cached_property
+    def controller_stage(self) -> Stage:
+        """Where the controller lies."""
+        m = self.method
+        source = self.replay_stage or self.experience_stage
+        config = dict(
+            source=source.directory.name, share=m.share, look_ahead=m.look_ahead,
+            mirror=m.mirror, frame=m.frame, fit=self._fit,
+        )  # fmt: skip
+        again = {"repeat": self.repeat} if self.repeat else {}
+        return Stage.open(self.root, self._label, config | again)
+
+    @property
+    def _fit_key(self) -> jax.Array:
+        key = self._key(2)
+        return jax.random.fold_in(key, self.repeat) if self.repeat else key
+
+    @functools.cached_property
+    def _fit(self) -> Fit:
+        settings = self.method.fit
+        return dataclasses.replace(
+            settings, updates=max(1, round(settings.updates * self.scale.updates))
+        )
+
+    def controller(self) -> Steering:
+        """The fitted models."""
+        stage, m = self.controller_stage, self.method
+        if not stage.done:
+            record = self.experience().first_share(m.share)
+            samples = pairs(
+                self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
+            )
+            model = fit(self.robot, samples, self._fit_key, self._fit, frame=m.frame, stage=stage)
+            model.save(stage.path("controller"), overwrite=True)
+            stage.finish(
+                {
+                    "robot": self.robot.name,
+                    "method": m.name,
+                    "experience": self.experience_stage.directory.name,
+                    "interactions": self._count(self.experience_stage, "interactions"),
+                    "learned_from": record.interactions,
+                    "replayed": self._count(self.replay_stage, "replayed"),
+                    "settings": plain(dataclasses.replace(m, fit=self._fit)),
+                }
+            )
+            stage.clear_checkpoints()
+        return controller.load(stage.path("controller"), self.robot)
+
+    def _count(self, stage: Stage | None, what: str) -> int:
+        return stage.summary()[what] if stage else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class DirectCell(Cell[Direct]):
+    """A method whose agent learns to go to goals, and whose policy is the controller."""
+
+    @functools.cached_property
+    def controller_stage(self) -> Stage:
+        return Stage.open(self.root, self._label, self._learning())
+
+    def controller(self) -> Steering:
+        """The policy that the agent ended with."""
+        stage, m = self.controller_stage, self.method
+        if not stage.done:
+            _, policy = self._collect(stage, keep=False)
+            assert policy  # no Direct method has an agent that learns nothing
+            policy.save(stage.path("controller"), overwrite=True)
+            interactions = whole(m.agent, self.scale.interactions)
+            stage.finish(
+                {
+                    "robot": self.robot.name,
+                    "method": m.name,
+                    "interactions": interactions,
+                    "learned_from": interactions,
+                    "replayed": 0,
+                    "settings": plain(m),
+                }
+            )
+            stage.clear_checkpoints()
+        return controller.load(stage.path("controller"), self.robot)
+
+
+def save_test(stage: Stage, outcome: Episodes, ways: list[np.ndarray]) -> None:
+    """Writes the outcome of a test, and the ways of its tours."""
+    tree = {
+        "episodes": dataclasses.asdict(outcome),
+        "ways": {str(i): w for i, w in enumerate(ways)},
+    }
+    files.save_arrays(stage.path("episodes"), tree, {}, overwrite=True)

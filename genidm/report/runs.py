@@ -1,0 +1,138 @@
+"""The finished tests of a robot, found where their stages lie."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from genidm import files
+from genidm.config import plain
+from genidm.episodes import Episodes
+from genidm.evaluate import Test
+from genidm.methods import ORDER
+from genidm.report.rows import Row
+from genidm.robots import Robot
+from genidm.scenarios import Scenarios
+
+
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """A finished test, as its stage holds it.
+
+    Attributes:
+      directory: of the stage.
+      summary: what it was finished with.
+    """
+
+    directory: Path
+    summary: dict[str, Any]
+
+    @functools.cached_property
+    def _tree(self) -> dict[str, Any]:
+        return files.load_arrays(self.directory / "episodes")[0]
+
+    @property
+    def episodes(self) -> Episodes:
+        """The outcome."""
+        return Episodes(**self._tree["episodes"])
+
+    @property
+    def ways(self) -> list[np.ndarray]:
+        """Positions `[steps + 1, 3]` in the episodes of the tours (Fig. 8), metres."""
+        ways = self._tree.get("ways", {})
+        return [ways[str(i)] for i in range(len(ways))]
+
+    @property
+    def controller(self) -> Path:
+        """Where the controller lies that was tested."""
+        return self.directory.parent / self.summary["fit"] / "controller"
+
+
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """All that a report is made from.
+
+    Attributes:
+      robot: whose report it is.
+      root: where its stages lie.
+      bank: the scenarios of the table.
+      found: method → its tests, one a training seed, in the order of the rows; the table's
+        own test, on the bank, is the first.
+    """
+
+    robot: Robot
+    root: Path
+    bank: Scenarios
+    found: dict[str, list[Tested]]
+
+    def row(self, name: str, invariance: float | None = None) -> Row:
+        """The row of a method."""
+        tests = self.found[name]
+        return Row(
+            method=name,
+            episodes=tests[0].episodes,
+            interactions=tests[0].summary["interactions"],
+            replayed=tests[0].summary["replayed"],
+            settings=tests[0].summary["settings"],
+            collecting_seeds={test.summary["seed"]: test.episodes for test in tests},
+            invariance=invariance,
+        )
+
+    def last_chunk(self) -> Path | None:
+        """The last part of the record that a row learned from: the lowest that has one here."""
+        for tests in reversed(self.found.values()):
+            stage = tests[0].summary.get("experience")
+            chunks = sorted(self.root.glob(f"{stage}/experience/chunk_*")) if stage else []
+            if chunks:
+                return chunks[-1]
+        return None
+
+
+def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) -> Runs:
+    """The tests of every method that was tested on `bank`.
+
+    A method's row is its newest test with the lowest training seed; its newest tests with
+    the other seeds, on whatever part of the bank, give the spread.
+
+    Args:
+      robot: whose they are.
+      root: where its stages lie.
+      bank: the scenarios of the table.
+      scale: the scale that the methods were run at.
+      settings: of the test.
+    """
+    return Runs(robot, root, bank, _by_method(_finished(root, scale, settings), bank.digest()))
+
+
+def _finished(root: Path, scale: str, settings: Test) -> Iterator[Tested]:
+    """All finished tests at a scale, oldest first."""
+    done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
+    for path in done:
+        summary = files.load_json(path)
+        if summary["scale"] == scale and summary["test"] == plain(settings):
+            yield Tested(path.parent, summary)
+
+
+def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
+    """Method → its newest test of each training seed, the one on the bank first."""
+    newest: dict[str, dict[int, Tested]] = {}
+    for test in done:
+        seeds = newest.setdefault(test.summary["method"], {})
+        kept = seeds.get(test.summary["seed"])
+        # A test on another part of the bank does not stand in for one on the bank.
+        if not kept or kept.summary["scenarios"] != digest or test.summary["scenarios"] == digest:
+            seeds[test.summary["seed"]] = test
+    rows = {}
+    for name in sorted(newest, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n)):
+        order = sorted(
+            newest[name].values(),
+            key=lambda t: (t.summary["scenarios"] != digest, t.summary["seed"]),
+        )
+        if order[0].summary["scenarios"] == digest:
+            rows[name] = order
+    return rows

@@ -1,0 +1,134 @@
+"""What the figures of a report show, computed once from the stages of its methods."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from genidm import controller, experience, files, stats, symmetry
+from genidm.invariance import ANGLES, invariance, probes
+from genidm.progress import METRICS, read_metrics
+from genidm.report.figures import Panel
+from genidm.report.runs import Runs
+from genidm.robots import Robot
+from genidm.scenarios import TOUR, UNSEEN_YAW, Scenarios, tours
+
+Curves = dict[str, list[dict[str, Any]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """The data of the figures.
+
+    Attributes:
+      closest: method → closest distance `[seeds, episodes]`, metres; NaN where it diverged.
+      heading, bearing: `[seeds, episodes]`, radians: of the robot at the start, and of the
+        target from it.
+      panels: the ways of Fig. 8.
+      collecting: agent → metrics while it collected.
+      learning: method → metrics while its agent learned to go to goals.
+      fitting: method → metrics of its fit.
+      residuals: mode of 𝒢 → its residual (`genidm.generalize.residual`).
+      changes: method → change of its actions `[angles, states]` at `ANGLES`; empty where no
+        record lies to draw states from.
+    """
+
+    closest: dict[str, np.ndarray]
+    heading: np.ndarray
+    bearing: np.ndarray
+    panels: list[Panel]
+    collecting: Curves
+    learning: Curves
+    fitting: Curves
+    residuals: dict[str, dict[str, np.ndarray]]
+    changes: dict[str, np.ndarray]
+
+    def invariance(self, name: str) -> float | None:
+        """Mean change of a method's action, over states and all turns but 0; None if unknown."""
+        change = self.changes.get(name)
+        return None if change is None else float(change[ANGLES > 0].mean())
+
+
+def gather(runs: Runs) -> Shown:
+    """All that the figures of a report show."""
+    heading, bearing = _angles(runs.robot, runs.bank)
+    learned = {name: _metrics(tests[0].controller.parent) for name, tests in runs.found.items()}
+    return Shown(
+        closest={name: stats.masked(tests[0].episodes) for name, tests in runs.found.items()},
+        heading=heading,
+        bearing=bearing,
+        panels=_panels(runs),
+        collecting=_collecting(runs.root),
+        learning={name: records for name, records in learned.items() if _holds(records, "reached")},
+        fitting={
+            name: records for name, records in learned.items() if _holds(records, "loss_action")
+        },
+        residuals=_residuals(runs.root),
+        changes=_changes(runs),
+    )
+
+
+def _panels(runs: Runs) -> list[Panel]:
+    """Fig. 8: the ways of each method towards targets seen and unseen while learning."""
+    target = np.asarray(tours(runs.robot).target)
+    ways = {name: [way[:, :2] for way in tests[0].ways] for name, tests in runs.found.items()}
+    return [
+        ("as learned", {n: w[:TOUR] for n, w in ways.items()}, target[0, :, :2], 0.0),
+        ("turned 135°", {n: w[TOUR:] for n, w in ways.items()}, target[1, :, :2], UNSEEN_YAW),
+    ]
+
+
+def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
+    """Heading at the start, and the target's bearing from it, `[seeds, episodes]`, radians."""
+
+    def angles(keys: jax.Array, yaw: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = robot.reset(keys, yaw)
+        way = target - state.position
+        bearing = jax.numpy.arctan2(way[:, 1], way[:, 0]) - state.heading
+        return state.heading, symmetry.wrap(bearing)
+
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), bank)
+    out = jax.jit(angles)(flat.keys, flat.yaw, flat.target)
+    heading, bearing = (np.asarray(x).reshape(bank.shape) for x in out)
+    return heading, bearing
+
+
+def _collecting(root: Path) -> Curves:
+    curves = {}
+    for done in sorted(root.glob("experience-*/done.json")):
+        _, agent, seed, _ = done.parent.name.split("-")
+        curves[f"{agent}, seed {seed}"] = _metrics(done.parent)
+    return curves
+
+
+def _residuals(root: Path) -> dict[str, dict[str, np.ndarray]]:
+    done = sorted(root.glob("replay-*/done.json"))
+    stages = {path.parent.name.split("-")[1]: path.parent for path in done}
+    return {mode: files.load_arrays(stage / "residual")[0] for mode, stage in stages.items()}
+
+
+def _changes(runs: Runs) -> dict[str, np.ndarray]:
+    """How much the actions of every controller change in the states of one record, `[K, N]`."""
+    chunk = runs.last_chunk()
+    if chunk is None:
+        return {}
+    asked = probes(runs.robot, experience.load(chunk, runs.robot))
+    paths = {name: tests[0].controller for name, tests in runs.found.items()}
+    return {
+        name: invariance(runs.robot, controller.load(path, runs.robot), *asked, ANGLES)
+        for name, path in paths.items()
+        if path.exists()
+    }
+
+
+def _metrics(stage: Path) -> list[dict[str, Any]]:
+    path = stage / METRICS
+    return read_metrics(path) if path.exists() else []
+
+
+def _holds(records: list[dict[str, Any]], metric: str) -> bool:
+    return any(metric in record for record in records)

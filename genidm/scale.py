@@ -1,0 +1,62 @@
+"""How much of the paper's protocol is run."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from genidm.errors import BadInput
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How much of the paper's protocol is run.
+
+    Attributes:
+      name: as it stands in paths and results.
+      interactions: steps that are collected.
+      updates: share of a method's updates that are made.
+      seeds: test seeds.
+      episodes: test episodes a seed.
+      look_ahead: most steps to the intermediate goal. Agents that have just begun to learn
+        fall so soon that few of their episodes reach further.
+      share: least part of the record that is learned from: in the first half of a short one
+        the agent hardly walks.
+    """
+
+    name: str
+    interactions: int
+    updates: float
+    seeds: int
+    episodes: int
+    look_ahead: int = 1000
+    share: float = 0.0
+
+
+def scale_of(text: str, interactions: int) -> Scale:
+    """What `--scale` names: "paper", "quick", or a share of the paper's numbers.
+
+    Args:
+      text: what the user gave.
+      interactions: the paper's number for the robot.
+
+    Raises:
+      BadInput: it is none of these.
+    """
+    if text == "paper":
+        return Scale("paper", interactions, 1.0, 10, 1000)
+    if text == "quick":
+        return Scale("quick", 300_000, 0.1, 2, 50, look_ahead=50, share=1.0)
+    try:
+        share = float(text)
+    except ValueError:
+        share = 0.0
+    if not 0 < share < float("inf"):
+        raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
+    return Scale(
+        name=text,
+        interactions=max(1, round(interactions * share)),
+        updates=min(share, 1.0),
+        seeds=10,
+        episodes=max(10, round(1000 * min(share, 1.0))),
+        look_ahead=1000 if share > 0.2 else 50,
+    )

@@ -1,0 +1,314 @@
+"""The whole table: its rows and training seeds, what a failure or a kill costs, its report."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from killing import Killed, dies_at
+from point import Point
+from tiny import AGENTS, TEST, tiny
+
+from experiments import table1
+from experiments.table1 import Table, chosen, grouped, run, work
+from genidm import cells, experiment, files, methods, robots
+from genidm.agents.random import RandomActions
+from genidm.errors import BadInput
+from genidm.experiment import guarded
+from genidm.progress import Progress
+from genidm.report import shown
+from genidm.scenarios import scenarios
+
+# One record for all that learn from one, and one policy.
+RECORD = dict(agent=AGENTS[RandomActions])
+METHODS = [
+    *(tiny(m, **RECORD) for m in (methods.HF, methods.LR, methods.RS)),
+    tiny(methods.VGCP),
+]
+
+
+def options(out: Path, **changes) -> Table:
+    this = Table(scale="0.25", out=out / "runs", episodes=2, seeds=2, spread_episodes=1, test=TEST)
+    return dataclasses.replace(this, **{"results": out / "results", **changes})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_bank() -> Iterator[None]:
+    """Scenarios are drawn once for all cells: they see the robot and two numbers alone."""
+    with pytest.MonkeyPatch.context() as m:
+        draw = functools.cache(lambda *numbers: scenarios(Point(), *numbers))
+        m.setattr(experiment, "scenarios", lambda robot, *numbers: draw(*numbers))
+        m.setitem(robots.ROBOTS, "point", Point)
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("table")
+    report, failures = run(Point(), METHODS, options(out))
+    assert report == out / "runs" / "point" / "report-0.25" and not failures
+    return out
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(finished, tmp_path / "copy")
+
+
+def results(out: Path) -> dict:
+    return json.loads((out / "results" / "point.json").read_text())
+
+
+def stages(out: Path, glob: str) -> list[Path]:
+    return sorted(path.parent for path in (out / "runs" / "point").glob(f"{glob}/done.json"))
+
+
+@contextlib.contextmanager
+def counted(*names: str) -> Iterator[Counter]:
+    """How often functions that make stages are called meanwhile."""
+    calls: Counter = Counter()
+
+    def counting(name, made):
+        def wrapped(*args, **kwargs):
+            calls[name] += 1
+            return made(*args, **kwargs)
+
+        return wrapped
+
+    with pytest.MonkeyPatch.context() as m:
+        for name in names:
+            m.setattr(cells, name, counting(name, getattr(cells, name)))
+        yield calls
+
+
+# ── what is run ─────────────────────────────────────────────────────────────────────────────
+
+
+def test_table1_has_the_papers_seven_methods_and_its_rows_one_more() -> None:
+    assert [m.name for m in methods.TABLE1] == ["RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR"]
+    assert (*(m.name for m in methods.TABLE1), "HF") == methods.ORDER
+    assert Table().methods == methods.ORDER
+
+
+def test_methods_are_chosen_by_name() -> None:
+    assert chosen(Table()) == [*methods.TABLE1, methods.HF]
+    assert chosen(Table(extra=False)) == list(methods.TABLE1)
+    assert chosen(Table(methods=("LR", "RS", "LR"))) == [methods.LR, methods.RS]
+    with pytest.raises(BadInput, match="'XX'; there are: RS"):
+        chosen(Table(methods=("RS", "XX")))
+    with pytest.raises(BadInput, match="no method to run"):
+        chosen(Table(methods=("HF",), extra=False))
+
+
+def test_methods_with_one_experience_follow_each_other() -> None:
+    order = [m.name for m in grouped([*methods.TABLE1, methods.HF])]
+    assert order == ["RS", "RL", "GE", "LR", "HF", "VGCP", "HER_SP", "HER_DE"]
+
+
+def test_the_later_seeds_are_tested_on_the_beginning_of_the_bank(tmp_path: Path) -> None:
+    todo = work(Point(), METHODS, options(tmp_path, seed=3, seeds=3))
+    assert [item.cell.seed for item in todo] == [3] * 4 + [4] * 4 + [5] * 4
+    assert [item.bank.shape for item in todo] == [(10, 2)] * 4 + [(10, 1)] * 8
+    whole, part = todo[0].bank, todo[-1].bank
+    assert np.array_equal(whole.target[:, :1], part.target)
+    all_alike = work(Point(), METHODS, options(tmp_path, spread_episodes=7))
+    assert {item.bank.shape for item in all_alike} == {(10, 2)}
+
+
+def test_every_method_with_every_seed_has_been_tested_once(finished: Path) -> None:
+    tests = Counter(path.name.split("-")[1] for path in stages(finished, "test-*"))
+    assert tests == dict.fromkeys(("RS", "VGCP", "LR", "HF"), 2)
+    assert len(stages(finished, "experience-*")) == 2, "one a seed, shared by three methods"
+
+
+def test_what_is_done_is_not_done_again(copy: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)}
+    names = ("collect", "replay", "fit", "run")
+    with counted(*names) as calls, pytest.MonkeyPatch.context() as m:
+        m.setattr(table1, "write_report", lambda this, bank, options: copy)
+        run(Point(), METHODS, options(copy))
+    assert not calls
+    assert {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)} == before
+
+
+# ── the table ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_one_table_and_one_json_hold_all(finished: Path) -> None:
+    r = results(finished)
+    assert list(r["methods"]) == ["RS", "VGCP", "LR", "HF"]
+    assert r["scenarios"] == scenarios(Point(), 10, 2).digest()
+    assert list(r["paired"]) == ["VGCP-RS", "LR-VGCP", "HF-LR", "LR-RS"]
+    report = finished / "runs" / "point" / "report-0.25"
+    assert (report / "results.json").read_bytes() == (
+        finished / "results" / "point.json"
+    ).read_bytes()
+    for directory, prefix in ((report, ""), (finished / "results", "point_")):
+        drawn = {path.name.removeprefix(prefix) for path in directory.glob("*.png")}
+        assert {"invariance.png", "learning.png", "fitting.png", "violins.png"} < drawn
+        last = (directory / f"{prefix}table.txt").read_text().splitlines()[-1]
+        assert sorted(last.partition(": ")[2].split(", ")) == sorted(
+            path.name for path in directory.glob("*.png")
+        )
+
+
+def test_the_training_seeds_stand_beside(finished: Path) -> None:
+    for method in results(finished)["methods"].values():
+        over = method["collecting_seeds"]
+        assert method["training_seed"] == 0
+        assert (over["seeds"], over["episodes"]) == ([0, 1], [[10, 2], [10, 1]])
+        assert over["means"][0] == method["mean"] != over["means"][1]
+    text = (finished / "results" / "point_table.txt").read_text()
+    assert "All but “over seeds” is of training seed 0" in text
+    assert "“Over seeds” is of 2 training seeds" in text
+    assert "after the first tested on 10 × 1 episodes" in text.replace("\n", " ")
+
+
+def test_invariance_is_measured_on_one_record_for_all(finished: Path) -> None:
+    found = {name: m["invariance"] for name, m in results(finished)["methods"].items()}
+    assert found.keys() == {"RS", "VGCP", "LR", "HF"}
+    assert found["HF"] < 1e-5 < 1e-2 < min(found[n] for n in ("RS", "VGCP", "LR"))
+
+
+def test_a_report_reads_and_computes_once_for_both_places(copy: Path, monkeypatch) -> None:
+    read, made = Counter(), Counter()
+    load, angles = files.load_arrays, shown._angles
+    monkeypatch.setattr(files, "load_arrays", lambda p, **k: (read.update([p]), load(p, **k))[1])
+    monkeypatch.setattr(shown, "_angles", lambda *a: (made.update("a"), angles(*a))[1])
+    shutil.rmtree(copy / "results")
+    run(Point(), METHODS, options(copy))
+    assert (copy / "results" / "point_paths.png").exists()
+    assert made.total() == 1
+    assert {n for path, n in read.items() if path.name == "episodes"} == {1}
+
+
+def test_without_a_record_there_is_no_figure_of_invariance(copy: Path) -> None:
+    for stage in stages(copy, "experience-*"):
+        shutil.rmtree(stage)
+    shutil.rmtree(copy / "runs" / "point" / "report-0.25")
+    report, failures = run(Point(), METHODS, options(copy, seeds=1, results=None))
+    assert report and not failures
+    names = {path.name for path in report.glob("*.png")}
+    assert not names & {"invariance.png", "collecting.png"} and "paths.png" in names
+    assert "no record lies here" in (report / "table.txt").read_text()
+    found = json.loads((report / "results.json").read_text())["methods"]
+    assert not any("invariance" in method for method in found.values())
+
+
+# ── failures and kills ──────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def failing(monkeypatch) -> dict[str, Exception]:
+    """Method → what its cells fail with."""
+    wrong: dict[str, Exception] = {}
+    episodes = cells.Cell.episodes
+
+    def failing(self, *args):
+        if self.method.name in wrong:
+            raise wrong[self.method.name]
+        return episodes(self, *args)
+
+    monkeypatch.setattr(cells.Cell, "episodes", failing)
+    return wrong
+
+
+def test_a_method_that_fails_does_not_stop_the_others(copy: Path, failing, capsys) -> None:
+    for stage in stages(copy, "test-*"):
+        if "LR" in stage.name or "RS" in stage.name:
+            shutil.rmtree(stage)
+    failing |= {"HF": BadInput("the disk is full"), "LR": RuntimeError("out of memory")}
+    report, failures = run(Point(), METHODS, options(copy))
+    assert [str(error) for error in failures] == ["the disk is full", "out of memory"] * 2
+    said = capsys.readouterr().err
+    assert "error: HF, training seed 1: the disk is full\n" in said
+    assert "RuntimeError: out of memory" in said and "error: LR, training seed 0 failed" in said
+    assert report and list(results(copy)["methods"]) == ["RS", "VGCP", "HF"]
+
+
+def test_where_all_fail_there_is_no_report(tmp_path: Path, failing) -> None:
+    failing |= {method.name: BadInput("no") for method in METHODS}
+    report, failures = run(Point(), METHODS, options(tmp_path))
+    assert report is None and len(failures) == 8
+    assert not list(tmp_path.rglob("report*"))
+
+
+def test_a_table_that_was_killed_goes_on(copy: Path, monkeypatch) -> None:
+    whole = results(copy)
+    for stage in [*stages(copy, "LR-1-*"), *stages(copy, "test-LR-1-*")]:
+        shutil.rmtree(stage)
+    with monkeypatch.context() as m:
+        m.setattr(Progress, "advance", dies_at(1))
+        with pytest.raises(Killed):
+            run(Point(), METHODS, options(copy))
+    assert not stages(copy, "LR-1-*")
+    with counted("collect", "fit", "run") as calls:
+        run(Point(), METHODS, options(copy))
+    assert calls == Counter(fit=1, run=1)
+    assert results(copy) == whole
+
+
+# ── the command ─────────────────────────────────────────────────────────────────────────────
+
+
+def command(monkeypatch, *flags: str) -> int:
+    """The exit status of `python -m experiments.table1`."""
+    monkeypatch.setattr(sys, "argv", ["table1", *flags])
+    try:
+        guarded(table1.table1, "")
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--robot", "cow"), "'cow'"),
+        (("--methods", "RS", "XX"), "'XX'"),
+        (("--methods", "HF", "--no-extra"), "no method"),
+        (("--scale", "huge"), "--scale"),
+        (("--seeds", "0"), "seeds"),
+        (("--spread-episodes", "0"), "spread_episodes"),
+        (("--test.lanes", "0"), "lanes"),
+    ],
+)
+def test_bad_input_ends_in_a_sentence(tmp_path, monkeypatch, capsys, flags, why) -> None:
+    assert command(monkeypatch, "--robot", "point", "--out", str(tmp_path), *flags) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and why in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("errors", "status"),
+    [([], 0), ([BadInput("a")], 2), ([BadInput("a"), RuntimeError("b")], 1)],
+)
+def test_the_exit_status_tells_of_failures(
+    tmp_path, monkeypatch, capsys, errors: list[Exception], status: int
+) -> None:
+    (tmp_path / "table.txt").write_text("the table")
+    asked = []
+
+    def ran(*args):
+        asked.append(args)
+        return tmp_path, errors
+
+    monkeypatch.setattr(table1, "run", ran)
+    assert (
+        command(monkeypatch, "--robot", "point", "--methods", "LR", "RS", "--seed", "4") == status
+    )
+    ((robot, rows, given),) = asked
+    assert (robot.name, [row.name for row in rows], given.seed) == ("point", ["LR", "RS"], 4)
+    out = capsys.readouterr()
+    assert out.out == "the table\n"
+    assert (f"{len(errors)} cells did not end" in out.err) == bool(errors)
