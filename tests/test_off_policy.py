@@ -100,9 +100,9 @@ def statistics() -> Any:
 
 
 @functools.cache
-def brain(agent: OffPolicy) -> Any:
+def algorithm(agent: OffPolicy) -> Any:
     """Its start and its update, compiled."""
-    made = agent.brain(ROBOT, INPUTS)
+    made = agent.algorithm(ROBOT, INPUTS)
     return made._replace(start=jax.jit(made.start), update=jax.jit(made.update))
 
 
@@ -124,13 +124,13 @@ def test_sacs_update_is_made_of_braxs_losses() -> None:
     agent = SAC(**SETTINGS)
     networks = make_sac_networks(INPUTS, ACTIONS, normalize, agent.hidden)
     alpha_step, critic_step, policy_step = map(descent, make_losses(networks, 0.3, 0.9, ACTIONS))
-    ours = brain(agent).start(jax.random.key(0))
+    ours = algorithm(agent).start(jax.random.key(0))
     same(ours.critic, ours.target)
     policy, critic, target, log_alpha = ours.policy, ours.critic, ours.target, ours.log_alpha
     states = [optax.adam(1e-3).init(p) for p in (log_alpha, critic, policy)]
     for i in range(3):
         batch, key = minibatch(i), jax.random.key(i)
-        ours, info = brain(agent).update(ours, statistics(), batch, key)
+        ours, info = algorithm(agent).update(ours, statistics(), batch, key)
         keys, alpha, stats = jax.random.split(key, 3), jnp.exp(log_alpha), statistics()
         _, log_alpha, states[0] = alpha_step(log_alpha, states[0], policy, stats, batch, keys[0])
         critic_loss, critic, states[1] = critic_step(
@@ -202,7 +202,7 @@ AGENT_OF_ORACLE = DDPG(**SETTINGS, action_cost=0.05)
 @functools.cache
 def updated() -> tuple[Any, Any, dict[str, Any]]:
     """DDPG's networks, all unlike each other, before and after an update."""
-    update, start = brain(AGENT_OF_ORACLE).update, brain(AGENT_OF_ORACLE).start
+    update, start = algorithm(AGENT_OF_ORACLE).update, algorithm(AGENT_OF_ORACLE).start
     n, other = start(jax.random.key(0)), start(jax.random.key(1))
     same((n.policy, n.critic), (n.policy_target, n.critic_target))
     n = n.replace(policy_target=other.policy, critic_target=other.critic)
@@ -262,12 +262,12 @@ def test_what_is_cut_off_teaches_nothing(agent: OffPolicy) -> None:
         reward=jnp.where(cut, other.reward, batch.reward),
         next_observation=jnp.where(cut[:, None], other.next_observation, batch.next_observation),
     )
-    n, key = brain(agent).start(jax.random.key(0)), jax.random.key(1)
-    after, again = (brain(agent).update(n, statistics(), b, key) for b in (batch, changed))
+    n, key = algorithm(agent).start(jax.random.key(0)), jax.random.key(1)
+    after, again = (algorithm(agent).update(n, statistics(), b, key) for b in (batch, changed))
     same(after, again)
     whole = changed._replace(extras={"state_extras": {"truncation": 0 * batch.reward}})
     assert (
-        brain(agent).update(n, statistics(), whole, key)[1]["critic_loss"]
+        algorithm(agent).update(n, statistics(), whole, key)[1]["critic_loss"]
         != after[1]["critic_loss"]
     )
 
@@ -277,9 +277,9 @@ def test_what_is_cut_off_teaches_nothing(agent: OffPolicy) -> None:
 
 def actions(agent: OffPolicy, count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
     """Actions `[count, 3]` in one state, and what the policy says of it before tanh."""
-    policy = brain(agent).start(jax.random.key(0)).policy
+    policy = algorithm(agent).start(jax.random.key(0)).policy
     x, keys = minibatch().observation[0], jax.random.split(jax.random.key(1), count)
-    act = jax.jit(jax.vmap(brain(agent).act, (None, None, None, 0)))
+    act = jax.jit(jax.vmap(algorithm(agent).act, (None, None, None, 0)))
     return np.asarray(act(statistics(), policy, x, keys)), mu(float64(policy), np.asarray(x))
 
 
@@ -335,20 +335,20 @@ class Pointing(GoToGoal):
 def critics(agent: Any, learner: Any, x: jax.Array, a: jax.Array) -> np.ndarray:
     networks = agent.networks(ROBOT, x.shape[-1])
     network = networks.q_network if isinstance(agent, SAC) else networks[1]
-    mind = learner.mind
-    return np.asarray(network.apply(mind.statistics, mind.brain.critic, x, a)).min(-1)
+    training = learner.training
+    return np.asarray(network.apply(training.statistics, training.networks.critic, x, a)).min(-1)
 
 
 def entropy_bonus(agent: Any, learner: Any, x: jax.Array, best: jax.Array) -> np.ndarray:
     """What SAC's own noise costs a step, and its entropy is worth; DDPG has none."""
     if not isinstance(agent, SAC):
         return np.zeros(len(x))
-    networks, mind = agent.networks(ROBOT, x.shape[-1]), learner.mind
+    networks, training = agent.networks(ROBOT, x.shape[-1]), learner.training
     distribution = networks.parametric_action_distribution
-    logits = networks.policy_network.apply(mind.statistics, mind.brain.policy, x)
+    logits = networks.policy_network.apply(training.statistics, training.networks.policy, x)
     raw = distribution.sample_no_postprocessing(logits, jax.random.key(5))
     miss = jnp.sum((jnp.tanh(raw) - best) ** 2, axis=-1)
-    alpha = jnp.exp(mind.brain.log_alpha)
+    alpha = jnp.exp(training.networks.log_alpha)
     return np.asarray(-miss - alpha * distribution.log_prob(logits, raw))
 
 
@@ -439,24 +439,25 @@ def test_learning_waits_until_it_is_warm_and_then_moves_everything(name: str) ->
     task = LEARNERS[name][1]
     learning = PREPARED[name].learning(ROBOT, task, devices.mesh())
     learner = learning.place(jax.jit(learning.start)(jax.random.key(0)))
-    begun = jax.tree.map(jnp.copy, learner.mind.brain)
+    begun = jax.tree.map(jnp.copy, learner.training.networks)
     iterate = learning.prepare(learner)
     learner, _, info = iterate(learner)
-    same(learner.mind.brain, begun)
+    same(learner.training.networks, begun)
     assert info["critic_loss"] == info["policy_loss"] == 0
     learner, _, info = iterate(learner)
     moved = [
-        abs(x - y).max() for x, y in zip(*map(leaves, (learner.mind.brain, begun)), strict=True)
+        abs(x - y).max()
+        for x, y in zip(*map(leaves, (learner.training.networks, begun)), strict=True)
     ]
     assert min(moved) > 0 and info["critic_loss"] > 0
-    assert learner.mind.statistics.count.lo == learner.mind.buffer.written * 16 == 2 * SIZE
+    assert learner.training.statistics.count.lo == learner.training.buffer.written * 16 == 2 * SIZE
 
 
 @each
 def test_the_buffer_holds_what_was_recorded_and_nothing_that_diverged(name: str) -> None:
     record, learner = undisturbed(name)
-    rows, newest = learner.mind.buffer.rows, 3 * 8
-    assert learner.mind.buffer.written == 5 * 8 and rows.last.shape == (newest, 16)
+    rows, newest = learner.training.buffer.rows, 3 * 8
+    assert learner.training.buffer.written == 5 * 8 and rows.last.shape == (newest, 16)
     row = np.arange(5 * 8 - newest, 5 * 8) % newest
     for ours, theirs in ((rows.s, record.s), (rows.a, record.a), (rows.o_next, record.o_next)):
         np.testing.assert_array_equal(np.asarray(ours)[row], theirs[-newest:])
@@ -471,7 +472,7 @@ def test_the_statistics_are_those_of_the_inputs(name: str) -> None:
     record, learner = undisturbed(name)
     size = record.s.shape[-1]
     seen = np.float64(record.s).reshape(-1, size)
-    found = learner.mind.statistics
+    found = learner.training.statistics
     np.testing.assert_allclose(found.mean[:size], seen.mean(0), rtol=0, atol=1e-4)
     np.testing.assert_allclose(found.std[:size], np.maximum(seen.std(0), 1e-6), rtol=0, atol=1e-3)
 

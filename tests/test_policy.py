@@ -53,9 +53,9 @@ def learner(name: str, task: Task) -> Any:
     rng = np.random.default_rng(1)
     size = S + 3 * task.directed
     seen = jnp.float32(rng.normal(size=(50, size)) * 10.0 ** rng.uniform(-2, 1, size) + 0.3)
-    statistics = running_statistics.update(begun.mind.statistics, seen)
-    mind = begun.mind.replace(statistics=statistics)
-    return begun.replace(mind=jax.tree.map(moved, mind))
+    statistics = running_statistics.update(begun.training.statistics, seen)
+    training = begun.training.replace(statistics=statistics)
+    return begun.replace(training=jax.tree.map(moved, training))
 
 
 def moved(x: jax.Array) -> jax.Array:
@@ -79,15 +79,17 @@ ask = jax.jit(Policy.__call__)
 
 def braxs(name: str, task: Task, x: jax.Array) -> jax.Array:
     """Brax's own deterministic inference; DDPG, which Brax lacks, is tanh of its network."""
-    agent, mind, size = AGENTS[name], learner(name, task).mind, x.shape[-1]
+    agent, training, size = AGENTS[name], learner(name, task).training, x.shape[-1]
     if name == "DDPG":
-        return jnp.tanh(agent.networks(ROBOT, size)[0].apply(mind.statistics, mind.brain.policy, x))
+        return jnp.tanh(
+            agent.networks(ROBOT, size)[0].apply(training.statistics, training.networks.policy, x)
+        )
     if name == "SAC":
         make, networks = sac_networks.make_inference_fn, agent.networks(ROBOT, size)
-        params = (mind.statistics, mind.brain.policy)
+        params = (training.statistics, training.networks.policy)
     else:
         make, networks = ppo_networks.make_inference_fn, agent.networks(ROBOT, task)
-        params = (mind.statistics, mind.params.policy)
+        params = (training.statistics, training.params.policy)
     return make(networks)(params, deterministic=True)(x, jax.random.key(0))[0]
 
 

@@ -111,8 +111,8 @@ def test_seeds_matter_and_nothing_else_does() -> None:
 
 def test_what_learns_is_moved_by_every_iteration() -> None:
     learning = PREPARED.learning(ROBOT, TASK, devices.mesh())
-    begun = jax.jit(learning.start)(jax.random.key(0)).mind.params
-    ended = undisturbed()[1].mind
+    begun = jax.jit(learning.start)(jax.random.key(0)).training.params
+    ended = undisturbed()[1].training
     moved = [np.abs(x - y).max() for x, y in zip(leaves(begun), leaves(ended.params), strict=True)]
     assert min(moved) > 1e-4 and ended.statistics.count.lo == ITERATIONS * SIZE
 

@@ -52,7 +52,7 @@ def walking(bench: Bench) -> Probe:
     agent = _agent(bench, RL)
     assert isinstance(agent, ppo.PPO)
     _, learner = _started(bench, RL, agent)
-    policy = ppo.acting(learner.mind, bench.mesh)
+    policy = ppo.acting(learner.training, bench.mesh)
     program = agent.stepping(bench.robot, RL.task, bench.mesh)
     return _steps(agent, lambda lanes: program(*policy, lanes)[0], learner.lanes)
 

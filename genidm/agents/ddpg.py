@@ -15,10 +15,9 @@ from brax.training.networks import FeedForwardNetwork, make_policy_network, make
 from brax.training.types import Transition
 
 from genidm.agents.base import Metrics
-from genidm.agents.off_policy import Brain, Learner, OffPolicy
-from genidm.agents.policy import Policy, normalize
+from genidm.agents.off_policy import Algorithm, OffPolicy
+from genidm.agents.policy import normalize
 from genidm.robots.base import Robot
-from genidm.tasks import Task
 
 
 class Networks(flax.struct.PyTreeNode):
@@ -55,13 +54,6 @@ class DDPG(OffPolicy):
             make_q_network(size, actions, normalize, self.critic_hidden, n_critics=1),
         )
 
-    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
-        mind = learner.mind
-        return Policy(
-            params=mind.brain.policy, mean=mind.statistics.mean, std=mind.statistics.std,
-            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
-        )  # fmt: skip
-
     def loss_critic(
         self,
         critic: Any,
@@ -94,7 +86,7 @@ class DDPG(OffPolicy):
         value = q.apply(statistics, critic, batch.observation, jnp.tanh(raw))
         return self.action_cost * jnp.mean(raw**2) - jnp.mean(value)
 
-    def brain(self, robot: Robot, size: int) -> Brain:
+    def algorithm(self, robot: Robot, size: int) -> Algorithm:
         networks = self.networks(robot, size)
         adam = optax.adam(self.learning_rate)
 
@@ -140,4 +132,4 @@ class DDPG(OffPolicy):
             new = Networks(policy, critic, policy_target, critic_target, policy_state, critic_state)
             return new, {"critic_loss": critic_loss, "policy_loss": policy_loss}
 
-        return Brain(start, lambda n: n.policy, act, update)
+        return Algorithm(start, act, update)

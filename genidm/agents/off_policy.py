@@ -2,7 +2,7 @@
 
 An iteration is two programs, as PPO's: in the first every device steps its own lanes; in
 the second the buffer takes the steps in and `updates` minibatches are learned from, on one
-device. What differs between learners is a `Brain`.
+device. What differs between learners is a `Algorithm`.
 """
 
 from __future__ import annotations
@@ -42,26 +42,24 @@ from genidm.robots.base import Robot
 from genidm.tasks import GoToGoal, Lanes, Task, Verdict, input_size, inputs, outlook, split
 
 
-class Brain(NamedTuple):
+class Algorithm(NamedTuple):
     """What a learner is made of.
 
     Attributes:
-      start: key → networks and their optimizers, a tree.
-      policy: that tree → the part that acts.
-      act: (statistics, acting part, inputs `[I]`, key) → action `[A]`, with exploration.
+      start: key → networks and their optimizers, a tree whose `policy` acts.
+      act: (statistics, policy, inputs `[I]`, key) → action `[A]`, with exploration.
       update: (tree, statistics, Transition `[N, ...]`, key) → (tree, losses).
     """
 
     start: Callable[[jax.Array], Any]
-    policy: Callable[[Any], Any]
     act: Callable[[RunningStatisticsState, Any, jax.Array, jax.Array], jax.Array]
     update: Callable[..., tuple[Any, Metrics]]
 
 
-class Mind(flax.struct.PyTreeNode):
-    """What learns: the brain's tree, statistics of the inputs, the buffer, a key."""
+class TrainingState(flax.struct.PyTreeNode):
+    """What learns: networks with their optimizers, statistics of the inputs, the buffer, a key."""
 
-    brain: Any
+    networks: Any
     statistics: RunningStatisticsState
     buffer: Buffer
     key: jax.Array
@@ -71,7 +69,7 @@ class Learner(flax.struct.PyTreeNode):
     """All that is carried from one iteration to the next."""
 
     lanes: Lanes
-    mind: Mind
+    training: TrainingState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,47 +117,53 @@ class OffPolicy(abc.ABC):
             raise BadInput(f"{room} never holds the {self.warmup} of the warmup")
 
     @abc.abstractmethod
-    def brain(self, robot: Robot, size: int) -> Brain:
+    def algorithm(self, robot: Robot, size: int) -> Algorithm:
         """The learner's networks and losses, for inputs of this size."""
 
-    @abc.abstractmethod
     def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
         """The policy of a learner, without exploration."""
+        training = learner.training
+        statistics = training.statistics
+        return Policy(
+            params=training.networks.policy, mean=statistics.mean, std=statistics.std,
+            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
+        )  # fmt: skip
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         if self.her and not isinstance(task, GoToGoal):
             raise BadInput("HER relabels goals, and this task has none")
-        brain = self.brain(robot, input_size(robot, task))
-        walk = functools.partial(_walk, robot, task, brain, self.unroll)
+        algorithm = self.algorithm(robot, input_size(robot, task))
+        walk = functools.partial(_walk, robot, task, algorithm, self.unroll)
         sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
-        learn = functools.partial(self._learn, robot, task, brain)
+        learn = functools.partial(self._learn, robot, task, algorithm)
 
         def start(key: jax.Array) -> Learner:
-            lanes_key, networks, stream = jax.random.split(key, 3)
-            lanes = task.start(robot, jax.random.split(lanes_key, self.lanes))
-            mind = brain.start(networks)
+            keys = jax.random.split(key, 3)
+            lanes = task.start(robot, jax.random.split(keys[0], self.lanes))
+            networks = algorithm.start(keys[1])
             statistics = no_statistics(input_size(robot, task))
-            part = jax.eval_shape(walk, statistics, brain.policy(mind), lanes)[2]
-            return Learner(lanes, Mind(mind, statistics, empty(part, self.capacity), stream))
+            part = jax.eval_shape(walk, statistics, networks.policy, lanes)[2]
+            buffer = empty(part, self.capacity)
+            return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
         def place(learner: Learner) -> Learner:
-            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.mind, mesh))
+            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.training, mesh))
 
-        def acting(mind: Mind) -> Any:
-            return devices.put((mind.statistics, brain.policy(mind.brain)), mesh, None)
+        def acting(training: TrainingState) -> Any:
+            return devices.put((training.statistics, training.networks.policy), mesh, None)
 
         def prepare(learner: Learner) -> Iterate:
-            args = (*acting(learner.mind), learner.lanes)
+            args = (*acting(learner.training), learner.lanes)
             step = compiled(f"{self.title}'s stepping", jax.jit(sharded, donate_argnums=2), *args)
             part = jax.eval_shape(sharded, *args)[2]
             update = compiled(
-                f"{self.title}'s learning", jax.jit(learn, donate_argnums=0), learner.mind, part
+                f"{self.title}'s learning", jax.jit(learn, donate_argnums=0), learner.training, part
             )
 
             def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, part, seen = step(*acting(learner.mind), learner.lanes)
-                mind, losses = update(learner.mind, devices.gather(part, mesh))
-                return Learner(lanes, mind), experience, seen | losses
+                lanes, experience, part, seen = step(*acting(learner.training), learner.lanes)
+                training, losses = update(learner.training, devices.gather(part, mesh))
+                return Learner(lanes, training), experience, seen | losses
 
             return iterate
 
@@ -171,18 +175,18 @@ class OffPolicy(abc.ABC):
         return type(self).__name__
 
     def _learn(
-        self, robot: Robot, task: Task, brain: Brain, mind: Mind, part: Memory
-    ) -> tuple[Mind, Metrics]:
+        self, robot: Robot, task: Task, algorithm: Algorithm, training: TrainingState, part: Memory
+    ) -> tuple[TrainingState, Metrics]:
         """Takes `part [unroll, lanes, ...]` in, and learns from `updates` minibatches."""
-        buffer = insert(mind.buffer, part)
+        buffer = insert(training.buffer, part)
         fed = inputs(part.s, None if part.goal is None else part.goal - part.o)
-        statistics = running_statistics.update(mind.statistics, fed)
+        statistics = running_statistics.update(training.statistics, fed)
         left = steps_left(buffer)
 
         def update(tree: Any, key: jax.Array) -> tuple[Any, Metrics]:
             which, how = jax.random.split(key)
             batch = self.sample(robot, task, buffer, left, which)
-            return brain.update(tree, statistics, batch, how)
+            return algorithm.update(tree, statistics, batch, how)
 
         def learn(tree: Any, keys: jax.Array) -> tuple[Any, Metrics]:
             tree, info = jax.lax.scan(update, tree, keys)
@@ -192,11 +196,11 @@ class OffPolicy(abc.ABC):
             info = jax.eval_shape(learn, tree, keys)[1]
             return tree, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), info)
 
-        key, stream = jax.random.split(mind.key)
+        key, stream = jax.random.split(training.key)
         ready = buffer.filled * self.lanes >= max(self.warmup, 2 * self.lanes)
         keys = jax.random.split(stream, self.updates)
-        tree, info = jax.lax.cond(ready, learn, wait, mind.brain, keys)
-        return Mind(tree, statistics, buffer, key), info
+        tree, info = jax.lax.cond(ready, learn, wait, training.networks, keys)
+        return TrainingState(tree, statistics, buffer, key), info
 
     def sample(
         self, robot: Robot, task: Task, buffer: Buffer, left: jax.Array, key: jax.Array
@@ -227,7 +231,7 @@ class OffPolicy(abc.ABC):
 def _walk(
     robot: Robot,
     task: Task,
-    brain: Brain,
+    algorithm: Algorithm,
     unroll: int,
     statistics: RunningStatisticsState,
     policy: Any,
@@ -238,7 +242,7 @@ def _walk(
     def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Memory, Metrics]]:
         lanes, keys = split(lanes)
         fed = inputs(lanes.robots.observation, lanes.displacement)
-        action = jax.vmap(brain.act, (None, None, 0, 0))(statistics, policy, fed, keys)
+        action = jax.vmap(algorithm.act, (None, None, 0, 0))(statistics, policy, fed, keys)
         lanes, seen = task.advance(robot, lanes, action)
         return lanes, (record(seen), remember(robot, seen), task.metrics(robot, seen))
 

@@ -40,7 +40,7 @@ from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook, split
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
 
 
-class Mind(flax.struct.PyTreeNode):
+class TrainingState(flax.struct.PyTreeNode):
     """What learns: networks, their optimizer, the statistics of the states, a key."""
 
     params: PPONetworkParams
@@ -53,7 +53,7 @@ class Learner(flax.struct.PyTreeNode):
     """All that PPO carries from one iteration to the next."""
 
     lanes: Lanes
-    mind: Mind
+    training: TrainingState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,9 +110,10 @@ class PPO:
 
     def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
         """The policy of a learner, without exploration."""
-        mind = learner.mind
+        training = learner.training
+        statistics = training.statistics
         return Policy(
-            params=mind.params.policy, mean=mind.statistics.mean, std=mind.statistics.std,
+            params=training.params.policy, mean=statistics.mean, std=statistics.std,
             hidden=self.hidden, activation="tanh", directed=task.directed, robot=robot,
         )  # fmt: skip
 
@@ -131,7 +132,7 @@ class PPO:
             )
             return Learner(
                 lanes=task.start(robot, jax.random.split(lanes, self.lanes)),
-                mind=Mind(
+                training=TrainingState(
                     params=params,
                     optimizer=optimizer.init(params),
                     statistics=no_statistics(input_size(robot, task)),
@@ -140,20 +141,22 @@ class PPO:
             )
 
         def place(learner: Learner) -> Learner:
-            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.mind, mesh))
+            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.training, mesh))
 
         def prepare(learner: Learner) -> Iterate:
-            args = (*acting(learner.mind, mesh), learner.lanes)
+            args = (*acting(learner.training, mesh), learner.lanes)
             step = compiled("PPO's stepping", stepping, *args)
             batch = jax.eval_shape(stepping, *args)[2]
             update = compiled(
-                "PPO's learning", jax.jit(learn, donate_argnums=0), learner.mind, batch
+                "PPO's learning", jax.jit(learn, donate_argnums=0), learner.training, batch
             )
 
             def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, batch, seen = step(*acting(learner.mind, mesh), learner.lanes)
-                mind, losses = update(learner.mind, devices.gather(batch, mesh))
-                return Learner(lanes, mind), experience, seen | losses
+                lanes, experience, batch, seen = step(
+                    *acting(learner.training, mesh), learner.lanes
+                )
+                training, losses = update(learner.training, devices.gather(batch, mesh))
+                return Learner(lanes, training), experience, seen | losses
 
             return iterate
 
@@ -163,7 +166,7 @@ class PPO:
         """The first program of an iteration: every device steps its own lanes.
 
         Returns:
-          the jitted (*acting(mind, mesh), lanes `[B]`) → (lanes, Experience, Transition,
+          the jitted (*acting(training, mesh), lanes `[B]`) → (lanes, Experience, Transition,
           metrics), all but the lanes `[unroll, B, ...]`; it donates the lanes.
         """
         walk = functools.partial(
@@ -176,12 +179,12 @@ class PPO:
         self,
         networks: ppo_networks.PPONetworks,
         optimizer: optax.GradientTransformation,
-        mind: Mind,
+        training: TrainingState,
         batch: Transition,
-    ) -> tuple[Mind, Metrics]:
+    ) -> tuple[TrainingState, Metrics]:
         """`epochs` passes over a batch `[unroll, lanes, ...]`, in shuffled minibatches."""
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
-        statistics = running_statistics.update(mind.statistics, batch.observation)
+        statistics = running_statistics.update(training.statistics, batch.observation)
         loss = functools.partial(
             compute_ppo_loss,
             ppo_network=networks,
@@ -206,16 +209,16 @@ class PPO:
                 minibatch, carry, (parts, jax.random.split(noise, self.minibatches))
             )
 
-        key, stream = jax.random.split(mind.key)
+        key, stream = jax.random.split(training.key)
         (params, state), info = jax.lax.scan(
-            epoch, (mind.params, mind.optimizer), jax.random.split(stream, self.epochs)
+            epoch, (training.params, training.optimizer), jax.random.split(stream, self.epochs)
         )
-        return Mind(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
+        return TrainingState(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
 
 
-def acting(mind: Mind, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
-    """What of a mind chooses actions: statistics and policy, a copy on every device."""
-    return devices.put((mind.statistics, mind.params.policy), mesh, None)
+def acting(training: TrainingState, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
+    """What of the training state chooses actions: statistics and policy, a copy on every device."""
+    return devices.put((training.statistics, training.params.policy), mesh, None)
 
 
 def _walk(

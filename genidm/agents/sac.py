@@ -18,10 +18,9 @@ from brax.training.networks import make_policy_network, make_q_network
 from brax.training.types import Transition
 
 from genidm.agents.base import Metrics
-from genidm.agents.off_policy import Brain, Learner, OffPolicy
-from genidm.agents.policy import Policy, normalize
+from genidm.agents.off_policy import Algorithm, OffPolicy
+from genidm.agents.policy import normalize
 from genidm.robots.base import Robot
-from genidm.tasks import Task
 
 
 class Networks(flax.struct.PyTreeNode):
@@ -49,14 +48,7 @@ class SAC(OffPolicy):
             distribution,
         )
 
-    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
-        mind = learner.mind
-        return Policy(
-            params=mind.brain.policy, mean=mind.statistics.mean, std=mind.statistics.std,
-            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
-        )  # fmt: skip
-
-    def brain(self, robot: Robot, size: int) -> Brain:
+    def algorithm(self, robot: Robot, size: int) -> Algorithm:
         networks = self.networks(robot, size)
         adam = optax.adam(self.learning_rate)
         losses = make_losses(networks, self.reward_scale, self.discount, robot.action.size)
@@ -104,4 +96,4 @@ class SAC(OffPolicy):
             )
             return new, info
 
-        return Brain(start, lambda n: n.policy, act, update)
+        return Algorithm(start, act, update)
