@@ -23,7 +23,7 @@ def configure() -> None:
     """Sets jax up for this package; called on import, before a backend starts.
 
     - one CPU device a core (`GENIDM_DEVICES` overrides the number; a number the user
-      has already given to jax stands);
+      has already given to jax stands), and three of XLA's threads for each (`PJRT_NPROC`);
     - float32 matrix products at full precision (`JAX_DEFAULT_MATMUL_PRECISION` overrides);
     - the persistent compilation cache on, in `~/.cache/genidm/xla`
       (`JAX_COMPILATION_CACHE_DIR` overrides).
@@ -32,6 +32,9 @@ def configure() -> None:
     if not given and _setting("jax_num_cpu_devices") < 0:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         count = int(os.environ.get("GENIDM_DEVICES", cores or 1))
+        # XLA has a thread a core, and a device at work holds one while it waits for others to
+        # do parts of its work: with as many devices as cores 𝒢 hung on two cores, for ever.
+        os.environ.setdefault("PJRT_NPROC", str(3 * count))
         with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
             jax.config.update("jax_num_cpu_devices", count)
     if _setting("jax_default_matmul_precision") is None:
