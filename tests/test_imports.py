@@ -29,6 +29,7 @@ tasks
 experience
 agents.policy agents.buffer
 agents.base agents.her
+agents.alternating
 agents.off_policy
 agents.*
 agents

@@ -2,7 +2,7 @@
 
 An iteration is two programs, as PPO's: in the first every device steps its own lanes; in
 the second the buffer takes the steps in and `updates` minibatches are learned from, on one
-device. What differs between learners is a `Algorithm`.
+device. What differs between learners is an `Algorithm`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from brax.training.types import Transition
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.alternating import Learner, alternating
+from genidm.agents.base import Learning, Metrics
 from genidm.agents.buffer import (
     Buffer,
     Memory,
@@ -37,7 +38,6 @@ from genidm.agents.her import HER
 from genidm.agents.policy import Policy, no_statistics
 from genidm.errors import BadInput
 from genidm.experience import Experience, record
-from genidm.progress import compiled
 from genidm.robots.base import Robot
 from genidm.tasks import GoToGoal, Lanes, Task, Verdict, input_size, inputs, outlook, split
 
@@ -63,13 +63,6 @@ class TrainingState(flax.struct.PyTreeNode):
     statistics: RunningStatisticsState
     buffer: Buffer
     key: jax.Array
-
-
-class Learner(flax.struct.PyTreeNode):
-    """All that is carried from one iteration to the next."""
-
-    lanes: Lanes
-    training: TrainingState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,33 +139,11 @@ class OffPolicy(abc.ABC):
             buffer = empty(part, self.capacity)
             return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
-        def place(learner: Learner) -> Learner:
-            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.training, mesh))
-
         def acting(training: TrainingState) -> Any:
             return devices.put((training.statistics, training.networks.policy), mesh, None)
 
-        def prepare(learner: Learner) -> Iterate:
-            args = (*acting(learner.training), learner.lanes)
-            step = compiled(f"{self.title}'s stepping", jax.jit(sharded, donate_argnums=2), *args)
-            part = jax.eval_shape(sharded, *args)[2]
-            update = compiled(
-                f"{self.title}'s learning", jax.jit(learn, donate_argnums=0), learner.training, part
-            )
-
-            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, part, seen = step(*acting(learner.training), learner.lanes)
-                training, losses = update(learner.training, devices.gather(part, mesh))
-                return Learner(lanes, training), experience, seen | losses
-
-            return iterate
-
-        return Learning(start, place, prepare)
-
-    @property
-    def title(self) -> str:
-        """What the learner is called in messages."""
-        return type(self).__name__
+        stepping = jax.jit(sharded, donate_argnums=2)
+        return alternating(type(self).__name__, start, acting, stepping, learn, mesh)
 
     def _learn(
         self, robot: Robot, task: Task, algorithm: Algorithm, training: TrainingState, part: Memory

@@ -28,11 +28,11 @@ from flax import linen
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.alternating import Learner, alternating
+from genidm.agents.base import Learning, Metrics
 from genidm.agents.policy import Policy, no_statistics, normalize
 from genidm.errors import BadInput
 from genidm.experience import Experience, record
-from genidm.progress import compiled
 from genidm.robots.base import Robot
 from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook, split
 
@@ -47,13 +47,6 @@ class TrainingState(flax.struct.PyTreeNode):
     optimizer: Any
     statistics: RunningStatisticsState
     key: jax.Array
-
-
-class Learner(flax.struct.PyTreeNode):
-    """All that PPO carries from one iteration to the next."""
-
-    lanes: Lanes
-    training: TrainingState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +115,6 @@ class PPO:
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
         )
-        stepping = self.stepping(robot, task, mesh)
         learn = functools.partial(self._learn, networks, optimizer)
 
         def start(key: jax.Array) -> Learner:
@@ -140,27 +132,8 @@ class PPO:
                 ),
             )
 
-        def place(learner: Learner) -> Learner:
-            return Learner(devices.put(learner.lanes, mesh), devices.gather(learner.training, mesh))
-
-        def prepare(learner: Learner) -> Iterate:
-            args = (*acting(learner.training, mesh), learner.lanes)
-            step = compiled("PPO's stepping", stepping, *args)
-            batch = jax.eval_shape(stepping, *args)[2]
-            update = compiled(
-                "PPO's learning", jax.jit(learn, donate_argnums=0), learner.training, batch
-            )
-
-            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, batch, seen = step(
-                    *acting(learner.training, mesh), learner.lanes
-                )
-                training, losses = update(learner.training, devices.gather(batch, mesh))
-                return Learner(lanes, training), experience, seen | losses
-
-            return iterate
-
-        return Learning(start, place, prepare)
+        at_work = functools.partial(acting, mesh=mesh)
+        return alternating("PPO", start, at_work, self.stepping(robot, task, mesh), learn, mesh)
 
     def stepping(self, robot: Robot, task: Task, mesh: Mesh) -> Any:
         """The first program of an iteration: every device steps its own lanes.
