@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.errors import BadInput
 from genidm.evaluate import Test
@@ -47,6 +48,8 @@ class Options:
 def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     """The cell that a method and a user's options name."""
     scale = scale_of(options.scale, robot.paper_interactions)
+    if method.agent == PPO():
+        method = dataclasses.replace(method, agent=scale.ppo)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale, seed=options.seed, root=options.out / robot.name,
         test=options.test,

@@ -34,6 +34,7 @@ from experiments import evaluate, walk
 from genidm import cells, controller, experiment, methods, stats
 from genidm import collect as collecting
 from genidm.agents.policy import Policy
+from genidm.agents.ppo import PPO
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.experiment import Options, cell, run_cell
@@ -255,6 +256,10 @@ def test_scales_are_shares_of_the_paper() -> None:
     this = cell(Point(), dataclasses.replace(LR, look_ahead=999), Options(scale="quick"))
     assert this.method.look_ahead == quick.look_ahead
     assert this.method.share == quick.share == 1.0
+    assert this.method.agent == quick.ppo != LR.agent
+    mine = dataclasses.replace(LR, agent=PPO(discount=0.9))
+    assert cell(Point(), mine, Options(scale="quick")).method.agent == mine.agent
+    assert cell(Point(), LR, Options(scale="paper")).method.agent == LR.agent
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
         with pytest.raises(BadInput, match="--scale"):
             scale_of(wrong, 2000)

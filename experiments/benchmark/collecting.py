@@ -13,8 +13,11 @@ import numpy as np
 
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, carried, timed
+from genidm import devices
 from genidm.agents import ppo
+from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Agent, Iterate, Learning
+from genidm.agents.off_policy import OffPolicy
 from genidm.collect import CHUNK, collect
 from genidm.experience import Experience, concatenate
 from genidm.methods import LR, RL, RS, Method
@@ -47,14 +50,23 @@ def unrecorded(bench: Bench) -> Probe:
     return _iterating(agent, iterate, learner, keep)
 
 
-def walking(bench: Bench) -> Probe:
-    """PPO's stepping alone: the policy is asked, all is recorded, nothing is learned."""
-    agent = _agent(bench, RL)
-    assert isinstance(agent, ppo.PPO)
-    _, learner = _started(bench, RL, agent)
-    policy = ppo.acting(learner.training, bench.mesh)
-    program = agent.stepping(bench.robot, RL.task, bench.mesh)
-    return _steps(agent, lambda lanes: program(*policy, lanes)[0], learner.lanes)
+def walking(bench: Bench, *, method: Method) -> Probe:
+    """A learner's stepping alone: the policy is asked, all is recorded, nothing is learned."""
+    agent, programs, learner = _programs(bench, method)
+    policy = programs.acting(learner.training)
+    return _steps(agent, lambda lanes: programs.stepping(*policy, lanes)[0], learner.lanes)
+
+
+def updating(bench: Bench, *, method: Method) -> Probe:
+    """An off-policy learner's other half alone: the same steps taken in again and again."""
+    agent, programs, learner = _programs(bench, method)
+    batch = programs.stepping(*programs.acting(learner.training), learner.lanes)[2]
+    batch = devices.gather(batch, bench.mesh)
+
+    def update(training: Any) -> Any:
+        return programs.updating(training, batch)[0]
+
+    return _steps(agent, update, learner.training)
 
 
 def writing(bench: Bench) -> Probe:
@@ -66,7 +78,16 @@ def writing(bench: Bench) -> Probe:
 
 
 def _agent(bench: Bench, method: Method) -> Any:
-    return dataclasses.replace(method.agent, lanes=bench.options.lanes)
+    """The method's agent, which learns from its first iteration on."""
+    agent = dataclasses.replace(method.agent, lanes=bench.options.lanes)
+    return dataclasses.replace(agent, warmup=0) if isinstance(agent, OffPolicy) else agent
+
+
+def _programs(bench: Bench, method: Method) -> tuple[Any, Alternating, Learner]:
+    """The method's agent, its two programs, and its learner at the start."""
+    agent = _agent(bench, method)
+    programs = agent.programs(bench.robot, method.task, bench.mesh)
+    return agent, programs, programs.place(jax.jit(programs.start)(jax.random.key(0)))
 
 
 def _started(bench: Bench, method: Method, agent: Agent) -> tuple[Learning, Any]:

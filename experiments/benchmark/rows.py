@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Sequence
 
-from experiments.benchmark.collecting import collecting, unrecorded, walking, writing
+from experiments.benchmark.collecting import collecting, unrecorded, updating, walking, writing
 from experiments.benchmark.comparing import Row
 from experiments.benchmark.evaluating import evaluating, tested
 from experiments.benchmark.fitting import fitting, multiplying
@@ -14,7 +14,7 @@ from experiments.benchmark.replaying import generalizing
 from experiments.benchmark.starting import starting
 from experiments.benchmark.stepping import in_c, raw
 from genidm.errors import BadInput
-from genidm.methods import GE, LR, RL, RS
+from genidm.methods import GE, HER_DE, HER_SP, LR, RL, RS, Method
 
 _P = functools.partial  # one object a build: rows that share it share what it compiles
 _RAW = _P(raw)
@@ -28,6 +28,18 @@ def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
     return base, Row(f"second start, {name}", unit, second, base.name, 1)
 
 
+def _halves(method: Method) -> tuple[Row, Row, Row]:
+    """The loop of an off-policy learner beside its two halves, each run alone."""
+    learning = Row(f"{method.name}'s learning alone", "steps/s", _P(updating, method=method))
+    stepping = Row(
+        f"{method.name}'s stepping alone", "steps/s", _P(walking, method=method), "raw MJX"
+    )
+    loop = Row(
+        f"collecting, {method.name}", "steps/s", _P(collecting, method=method), learning.name
+    )
+    return learning, stepping, loop
+
+
 ROWS: tuple[Row, ...] = (
     Row("MuJoCo in C", "steps/s", in_c),
     Row("raw MJX", "steps/s", _RAW, "MuJoCo in C"),
@@ -37,10 +49,12 @@ ROWS: tuple[Row, ...] = (
     Row("raw MJX, all devices", "steps/s", _RAW, "raw MJX, one device"),
     Row("collecting, random actions", "steps/s", _P(collecting, method=RS), "raw MJX"),
     Row("collecting, PPO", "steps/s", _PPO, "raw MJX"),
-    Row("collecting, PPO's stepping alone", "steps/s", walking, "raw MJX"),
+    Row("collecting, PPO's stepping alone", "steps/s", _P(walking, method=RL), "raw MJX"),
     Row("PPO, record dropped", "steps/s", unrecorded),
     Row("PPO, record kept", "steps/s", _PPO, "PPO, record dropped"),
     Row("writing the record", "steps/s", writing, "collecting, PPO"),
+    *_halves(HER_SP),
+    *_halves(HER_DE),
     Row("𝒢", "steps/s", _P(generalizing), "raw MJX, wide"),
     Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), "raw MJX, wide"),
     Row("evaluation", "lane-steps/s", evaluating, "raw MJX, wide"),

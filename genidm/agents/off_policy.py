@@ -21,8 +21,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.types import Transition
 from jax.sharding import Mesh
 
-from genidm import devices
-from genidm.agents.alternating import Learner, alternating
+from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Learning, Metrics
 from genidm.agents.buffer import (
     Buffer,
@@ -123,11 +122,18 @@ class OffPolicy(abc.ABC):
         )  # fmt: skip
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        return self.programs(robot, task, mesh).learning()
+
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
+        """The two programs of an iteration.
+
+        Raises:
+          BadInput: there is HER, and the task has no goals.
+        """
         if self.her and not isinstance(task, GoToGoal):
             raise BadInput("HER relabels goals, and this task has none")
         algorithm = self.algorithm(robot, input_size(robot, task))
         walk = functools.partial(_walk, robot, task, algorithm, self.unroll)
-        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
         learn = functools.partial(self._learn, robot, task, algorithm)
 
         def start(key: jax.Array) -> Learner:
@@ -139,11 +145,10 @@ class OffPolicy(abc.ABC):
             buffer = empty(part, self.capacity)
             return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
-        def acting(training: TrainingState) -> Any:
-            return devices.put((training.statistics, training.networks.policy), mesh, None)
+        def chosen(training: TrainingState) -> tuple[RunningStatisticsState, Any]:
+            return training.statistics, training.networks.policy
 
-        stepping = jax.jit(sharded, donate_argnums=2)
-        return alternating(type(self).__name__, start, acting, stepping, learn, mesh)
+        return Alternating(type(self).__name__, start, chosen, walk, learn, mesh)
 
     def _learn(
         self, robot: Robot, task: Task, algorithm: Algorithm, training: TrainingState, part: Memory

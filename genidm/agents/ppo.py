@@ -27,8 +27,7 @@ from brax.training.types import Transition
 from flax import linen
 from jax.sharding import Mesh
 
-from genidm import devices
-from genidm.agents.alternating import Learner, alternating
+from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Learning, Metrics
 from genidm.agents.policy import Policy, no_statistics, normalize
 from genidm.errors import BadInput
@@ -111,10 +110,15 @@ class PPO:
         )  # fmt: skip
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        return self.programs(robot, task, mesh).learning()
+
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
+        """The two programs of an iteration."""
         networks = self.networks(robot, task)
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
         )
+        walk = functools.partial(_walk, robot, task, networks, self.unroll, self.discount)
         learn = functools.partial(self._learn, networks, optimizer)
 
         def start(key: jax.Array) -> Learner:
@@ -132,21 +136,10 @@ class PPO:
                 ),
             )
 
-        at_work = functools.partial(acting, mesh=mesh)
-        return alternating("PPO", start, at_work, self.stepping(robot, task, mesh), learn, mesh)
+        def chosen(training: TrainingState) -> tuple[RunningStatisticsState, Any]:
+            return training.statistics, training.params.policy
 
-    def stepping(self, robot: Robot, task: Task, mesh: Mesh) -> Any:
-        """The first program of an iteration: every device steps its own lanes.
-
-        Returns:
-          the jitted (*acting(training, mesh), lanes `[B]`) → (lanes, Experience, Transition,
-          metrics), all but the lanes `[unroll, B, ...]`; it donates the lanes.
-        """
-        walk = functools.partial(
-            _walk, robot, task, self.networks(robot, task), self.unroll, self.discount
-        )
-        sharded = devices.over_lanes(walk, mesh, [None, None, 0], (0, 1, 1, 1))
-        return jax.jit(sharded, donate_argnums=2)
+        return Alternating("PPO", start, chosen, walk, learn, mesh)
 
     def _learn(
         self,
@@ -187,11 +180,6 @@ class PPO:
             epoch, (training.params, training.optimizer), jax.random.split(stream, self.epochs)
         )
         return TrainingState(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
-
-
-def acting(training: TrainingState, mesh: Mesh) -> tuple[RunningStatisticsState, Any]:
-    """What of the training state chooses actions: statistics and policy, a copy on every device."""
-    return devices.put((training.statistics, training.params.policy), mesh, None)
 
 
 def _walk(

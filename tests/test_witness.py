@@ -1,0 +1,73 @@
+"""The witness has HER_SP's task: gymnasium's Ant and Stable-Baselines3 judge it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from experiments import witness
+from genidm.methods import HER_SP
+from genidm.robots import Ant
+
+pytest.importorskip("gymnasium.envs.mujoco", reason="gymnasium is without MuJoCo")
+
+
+@pytest.fixture(scope="module")
+def ant() -> Any:
+    return witness.goal_ant(HER_SP.task, Ant.target_distance, steps=20)
+
+
+def test_turns_agree_with_scipy() -> None:
+    start = Rotation.from_euler("zyx", [0.7, 0.2, -0.1])
+    for yaw in (-2.0, 0.5, 3.0):
+        turned = Rotation.from_euler("z", yaw) * start
+        ours = witness.turned(start.as_quat(scalar_first=True), yaw)
+        np.testing.assert_allclose(ours, turned.as_quat(scalar_first=True), atol=1e-12)
+        np.testing.assert_allclose(
+            witness.rotation(yaw) @ [1.0, 2.0],
+            Rotation.from_euler("z", yaw).apply([1.0, 2.0, 0.0])[:2],
+        )
+        facing = turned.apply([1.0, 0.0, 0.0])
+        assert witness.heading(ours) == pytest.approx(math.atan2(facing[1], facing[0]))
+
+
+def test_starts_and_goals_are_those_of_the_papers_test(ant: Any) -> None:
+    starts, bearings, distances = [], [], []
+    for seed in range(200):
+        seen, _ = ant.reset(seed=seed)
+        ahead = seen["desired_goal"] - seen["achieved_goal"]
+        facing = witness.heading(ant.unwrapped.data.qpos[3:7])
+        starts.append(facing)
+        bearing = math.atan2(ahead[1], ahead[0]) - facing
+        bearings.append(math.remainder(bearing, 2 * math.pi))
+        distances.append(np.linalg.norm(ahead))
+    assert np.max(np.abs(bearings)) <= math.pi / 4 + 1e-9 and np.std(bearings) > 0.4
+    assert 2 <= min(distances) < 2.1 and 4.9 < max(distances) <= 5
+    assert min(starts) < -3 and max(starts) > 3 and len(set(distances)) == 200
+
+
+def test_reward_is_that_of_the_goal(ant: Any) -> None:
+    ant.reset(seed=0)
+    *_, reward, ended, late, _ = ant.step(np.zeros(8))
+    assert (reward, ended, late) == (-1.0, False, False)
+    ant.goal = ant.unwrapped.data.qpos[:2] + 0.05
+    *_, reward, ended, late, _ = ant.step(np.zeros(8))
+    assert (reward, ended, late) == (0.0, True, False)
+    many = ant.compute_reward(np.zeros((3, 2)), np.array([[0.0, 0.0], [0.09, 0], [0.0, 0.11]]), {})
+    np.testing.assert_array_equal(many, [0, 0, -1])
+
+
+def test_it_learns_and_is_tested(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env_checker.check_env(witness.goal_ant(HER_SP.task, Ant.target_distance, 20))
+    witness.main(tmp_path / "w.json", interactions=1000, episodes=2, parts=2)
+    result = json.loads((tmp_path / "w.json").read_text())
+    assert result["interactions"] == [504, 1008]  # whole rounds of 8
+    assert len(result["HER + SAC"]) == 2 and 0 < result["random"]["mean"] < 6
