@@ -53,6 +53,14 @@ def yaw_of(q: Array) -> Array:
     return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def euler_of(q: Array) -> Array:
+    """Roll, pitch and yaw `[..., 3]`, in radians, of orientations `[..., 4]`."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
+    return jnp.stack([roll, pitch, yaw_of(q)], axis=-1)
+
+
 def horizontal(v: Array) -> Array:
     """Length `[...]` of the horizontal part of vectors `[..., 3]`."""
     return jnp.hypot(v[..., 0], v[..., 1])
@@ -116,6 +124,23 @@ def quaternion(name: str) -> Field:
     """An orientation, given with w ≥ 0 because q and −q are one orientation but two inputs."""
     mirror = _signed([1, -1, 1, -1])
     return Field(name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of)
+
+
+def heading_vector(name: str, unit: str = "m") -> Field:
+    """A vector seen along the heading: x ahead, y to the left, z up."""
+    return Field(name, 3, "vector in the heading frame", unit, _keep, _signed([1, -1, 1]))
+
+
+def euler(name: str) -> Field:
+    """An orientation as roll, pitch and yaw (about the world's x, then y, then z).
+
+    A turn changes the yaw alone.
+    """
+
+    def turn(x: Array, yaw: Array) -> Array:
+        return x.at[..., 2].set(wrap(x[..., 2] + yaw))
+
+    return Field(name, 3, "Euler angles", "rad", turn, _signed([-1, 1, -1]), lambda x: x[..., 2])
 
 
 def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: str) -> Field:

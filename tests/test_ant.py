@@ -10,42 +10,18 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from scipy.spatial.transform import Rotation
 
 from genidm import symmetry
 from genidm.robots import Ant, State
 from genidm.robots.mjx import Physics, mirror_of
-from genidm.symmetry import Layout
 from genidm.tasks import Lanes, Step, WalkForward
 
 LANES = 32
 
 
 # ── MuJoCo in C ─────────────────────────────────────────────────────────────────────────────
-
-
-def step_in_c(ant: Ant, physics: Physics, actions: np.ndarray) -> tuple[Physics, np.ndarray]:
-    """Control steps in float64: physics `[B, ...]` after them, and wrenches `[B, nbody, 6]`.
-
-    Args:
-      ant: whose model.
-      physics: before.
-      actions: `[T, B, A]`.
-    """
-    data, lanes = mujoco.MjData(ant.mj_model), []
-    for lane in range(actions.shape[1]):
-        mujoco.mj_resetData(ant.mj_model, data)
-        data.qpos, data.qvel = physics.qpos[lane], physics.qvel[lane]
-        data.qacc_warmstart = physics.warmstart[lane]
-        for action in actions[:, lane]:
-            data.ctrl = action
-            mujoco.mj_step(ant.mj_model, data, ant.frames)
-        mujoco.mj_rnePostConstraint(ant.mj_model, data)
-        lanes.append([data.qpos, data.qvel, data.qacc_warmstart, data.cfrc_ext])
-        lanes[-1] = [x.copy() for x in lanes[-1]]
-        assert data.time == pytest.approx(len(actions) * ant.control_step)  # not reset on the way
-    *after, contact = map(np.stack, zip(*lanes, strict=True))
-    return Physics(*after), contact
 
 
 def observed_in_c(physics: Physics, contact: np.ndarray) -> np.ndarray:
@@ -59,18 +35,6 @@ def observed_in_c(physics: Physics, contact: np.ndarray) -> np.ndarray:
             part[2] = np.clip(part[2], -1, 1)
         rows.append(np.concatenate([qpos[2:3], quaternion, qpos[7:], qvel, clipped.ravel()]))
     return np.stack(rows)
-
-
-def positive_w(physics: Physics) -> Physics:
-    """q and −q are one orientation: the one that the layouts give."""
-    sign = np.where(physics.qpos[:, 3:4] < 0, -1.0, 1.0)
-    qpos = np.asarray(physics.qpos).copy()
-    qpos[:, 3:7] *= sign
-    return Physics(qpos, np.asarray(physics.qvel), np.asarray(physics.warmstart))
-
-
-def assert_close(x: Any, y: Any, **tolerance: float) -> None:
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), x, y)
 
 
 @pytest.fixture(scope="module")
@@ -93,11 +57,6 @@ def robot(ant: Ant) -> Ant:
     robot = copy.copy(ant)
     robot.step, robot.reset = jax.jit(ant.step), jax.jit(ant.reset)  # type: ignore[method-assign]
     return robot
-
-
-def placed(robot: Ant, physics: Physics) -> State:
-    physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), physics)
-    return robot.place(physics, jnp.zeros(LANES))
 
 
 # ── (a) against C ───────────────────────────────────────────────────────────────────────────
@@ -171,38 +130,13 @@ def episode(starts: Physics, ant: Ant) -> tuple[Any, ...]:
     return actions, after, contact
 
 
-def wrenches(ant: Ant) -> Layout:
-    return Layout((ant.observation.fields[-1],))
-
-
-def assert_commutes(ant: Ant, starts: Physics, episode: tuple[Any, ...], change: Any) -> None:
-    """Steps in C from the changed start, and compares with the changed outcome.
-
-    Args:
-      ant: the robot.
-      starts: physics before.
-      episode: what the fixture gives.
-      change: (layout, x) → x as the layout transforms it.
-    """
-    actions, after, contact = episode
-    with jax.enable_x64(True):
-        on = lambda layout, x: np.asarray(change(layout, x))  # noqa: E731
-        physics = [jax.tree.map(on, ant.physics, p) for p in (starts, positive_w(after))]
-        outcome = on(ant.observation, observed_in_c(after, contact))
-        felt = on(wrenches(ant), contact.reshape(LANES, -1)).reshape(contact.shape)
-        got, got_contact = step_in_c(ant, physics[0], on(ant.action, actions))
-    assert_close(positive_w(got), physics[1], atol=1e-6)
-    assert_close(got_contact, felt, atol=1e-6)  # unclipped, N: up to hundreds
-    assert_close(observed_in_c(got, got_contact), outcome, atol=1e-6)
-
-
 def test_yaw_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
     yaw = np.linspace(-np.pi, np.pi, LANES)
-    assert_commutes(ant, starts, episode, lambda layout, x: layout.turn(x, yaw))
+    assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.turn(x, yaw))
 
 
 def test_mirror_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
-    assert_commutes(ant, starts, episode, lambda layout, x: layout.mirror(x))
+    assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.mirror(x))
 
 
 def test_mirror_is_read_off_the_model(ant: Ant) -> None:

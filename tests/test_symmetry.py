@@ -19,7 +19,9 @@ FIELDS = [
     symmetry.joints("joints", [1, 0, 2], [-1, -1, 1], "rad"),
     symmetry.wrenches("contact", [0, 2, 1]),
 ]
-each_field = pytest.mark.parametrize("field", FIELDS, ids=lambda f: f.name)
+EULER = symmetry.euler("angles")
+OTHERS = [symmetry.heading_vector("velocity ahead", "m/s"), EULER]
+each_field = pytest.mark.parametrize("field", FIELDS + OTHERS, ids=lambda f: f.name)
 
 
 @pytest.fixture
@@ -31,6 +33,8 @@ def sample(rng: np.random.Generator, field: Field) -> jnp.ndarray:
     x = rng.normal(size=(LANES, field.size))
     if field.kind == "quaternion":
         return canonical(x / np.linalg.norm(x, axis=-1, keepdims=True))
+    if field is EULER:
+        return symmetry.euler_of(sample(rng, FIELDS[3]))
     return jnp.asarray(x)
 
 
@@ -53,6 +57,8 @@ def about_z(yaw: jnp.ndarray) -> Rotation:
 def same(field: Field, x: jnp.ndarray, y: jnp.ndarray) -> bool:
     if field.kind == "quaternion":  # where w is nearly 0, rounding may choose the other sign
         y = y * jnp.sign(jnp.sum(x * y, axis=-1, keepdims=True))
+    if field is EULER:  # where the yaw is nearly π, rounding may choose −π
+        y = x + symmetry.wrap(y - x)
     return np.allclose(x, y, atol=1e-5)
 
 
@@ -70,7 +76,8 @@ def test_turns_add_up(field: Field, rng: np.random.Generator) -> None:
 @pytest.mark.usefixtures("strict_ranks")
 def test_a_turn_by_nothing_changes_nothing(field: Field, rng: np.random.Generator) -> None:
     x = sample(rng, field)
-    assert np.array_equal(field.turn(x, jnp.zeros(LANES)), x)
+    turned = field.turn(x, jnp.zeros(LANES))
+    assert same(field, turned, x) if field is EULER else np.array_equal(turned, x)
 
 
 @each_field
@@ -98,7 +105,7 @@ def test_a_batch_is_its_lanes(field: Field, rng: np.random.Generator) -> None:
 def test_kinds_say_whether_a_turn_is_seen(field: Field, rng: np.random.Generator) -> None:
     x = sample(rng, field)
     moved = not np.allclose(field.turn(x, jnp.ones(LANES)), x)
-    assert moved == (field.kind in ("vector", "quaternion", "wrenches"))
+    assert moved == (field.kind in ("vector", "quaternion", "wrenches", "Euler angles"))
 
 
 # ── scipy ───────────────────────────────────────────────────────────────────────────────────
@@ -175,6 +182,16 @@ def test_torques_transform_as_arm_times_force(rng: np.random.Generator) -> None:
 
 def test_joints_go_to_the_joint_across() -> None:
     assert FIELDS[4].mirror(jnp.array([1.0, 2.0, 3.0])).tolist() == [-2.0, -1.0, 3.0]
+
+
+def test_angles_are_those_of_scipy(rng: np.random.Generator) -> None:
+    q, yaw = sample(rng, FIELDS[3]), angles(rng)
+    expected = rotation(q).as_euler("ZYX")[:, ::-1]
+    assert np.allclose(symmetry.euler_of(q), expected, atol=1e-4)
+    turned = symmetry.euler_of(symmetry.turn_quaternion(q, yaw))
+    assert same(EULER, EULER.turn(symmetry.euler_of(q), yaw), turned)
+    mirrored = symmetry.euler_of(FIELDS[3].mirror(q))
+    assert same(EULER, EULER.mirror(symmetry.euler_of(q)), mirrored)
 
 
 def test_wrap_brings_angles_into_one_turn() -> None:

@@ -3,8 +3,9 @@
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
+from genidm.robots.humanoid import Humanoid
 
-ROBOTS: dict[str, type[Robot]] = {Ant.name: Ant}
+ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid)}
 
 
 def by_name(name: str) -> Robot:
@@ -18,4 +19,4 @@ def by_name(name: str) -> Robot:
     return ROBOTS[name]()
 
 
-__all__ = ["ROBOTS", "Ant", "Robot", "State", "by_name"]
+__all__ = ["ROBOTS", "Ant", "Humanoid", "Robot", "State", "by_name"]

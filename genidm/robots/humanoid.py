@@ -1,0 +1,143 @@
+"""The Humanoid: PyBullet's, on MJX; seventeen torques, a 43-D state (Table 1, A.1.1)."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from genidm import symmetry
+from genidm.robots.base import State
+from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
+from genidm.symmetry import Layout
+
+Frame = Literal["heading", "world"]
+
+# PyBullet's motors, in its order: name, and power in N·m (pybullet_envs, robot_locomotors.py).
+POWER = {
+    "abdomen_z": 100, "abdomen_y": 100, "abdomen_x": 100,
+    "right_hip_x": 100, "right_hip_z": 100, "right_hip_y": 300, "right_knee": 200,
+    "left_hip_x": 100, "left_hip_z": 100, "left_hip_y": 300, "left_knee": 200,
+    "right_shoulder1": 75, "right_shoulder2": 75, "right_elbow": 75,
+    "left_shoulder1": 75, "left_shoulder2": 75, "left_elbow": 75,
+}  # fmt: skip
+# Of its power, the share that a motor may use.
+STRENGTH = 0.41
+# What Brax's file has otherwise on one side of the body, or than PyBullet's: degrees, N·m/rad,
+# kg·m².
+HIP_RANGE = (-120.0, 20.0)
+KNEE_STIFFNESS = 1.0
+HIP_ARMATURE = 0.01
+# Metres, in the torso's frame: PyBullet counts the base from its lowest geom's centre.
+BASE = np.array([-0.01, 0.0, -0.12])
+# Newtons: a foot that presses less is in the air.
+TOUCH = 1.0
+
+
+class Humanoid(MjxRobot):
+    """PyBullet's humanoid on MJX.
+
+    s `[43]` is PyBullet's state with the yaw itself in place of the direction to its target:
+    height − 0.8 m, 0.3 × velocity, roll, pitch, yaw, then for each joint its angle between
+    its limits (−1 to 1) and 0.1 × its velocity, and whether each foot touches the floor.
+
+    Args:
+      solver: of the contacts.
+      velocity: its frame. PyBullet turns it by the yaw, which takes from the LFM some of
+        what it is to learn; "world" leaves that to be learned.
+    """
+
+    name = "humanoid"
+    control_step = 0.0165
+    standing_height = 1.17
+    target_distance = (2.0, 5.0)
+    healthy_height = (0.78, math.inf)
+    paper_interactions = 15_000_000
+    # PyBullet's weights of the walking reward.
+    alive_bonus = 2.0
+    electricity_cost = 2.0
+    torque_cost = 0.1
+    limit_cost = 0.1
+
+    def __init__(self, solver: Solver | None = None, velocity: Frame = "heading"):
+        solver = solver or Solver()
+        self._in_heading = velocity == "heading"
+        super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), frames=4)
+        self.settings = {"name": self.name, "solver": solver, "velocity": velocity}
+        limits = self.mj_model.jnt_range[1:]
+        self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
+        self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])
+        m = self.mirror
+        motion = symmetry.heading_vector if self._in_heading else symmetry.vector
+        angle_and_rate = [2 * hinge + i for hinge in m.hinges for i in (0, 1)]
+        self.observation = Layout(
+            (
+                symmetry.invariant("height", unit="m above 0.8"),
+                motion("velocity", "m/s × 0.3"),
+                symmetry.euler("roll, pitch, yaw"),
+                symmetry.joints(
+                    "joint angles, velocities", angle_and_rate, np.repeat(m.signs, 2).tolist(),
+                    "of the range, rad/s × 0.1",
+                ),
+                symmetry.joints("feet on the floor", [1, 0], [1, 1], "yes or no"),
+            )
+        )  # fmt: skip
+
+    def rest_pose(self) -> np.ndarray:
+        pose = self.mj_model.qpos0.astype(np.float32)
+        pose[:3] = 0.0, 0.0, 1.4  # PyBullet's start, from which it drops onto its feet
+        return pose
+
+    def _draw(self, key: jax.Array) -> Physics:
+        """PyBullet's start: upright and at rest, with uniform noise in the joints."""
+        noise, count = self.reset_noise, len(self.mirror.hinges)
+        angles = jax.random.uniform(key, (count,), minval=-noise, maxval=noise)
+        qpos = jnp.asarray(self._rest).at[7:].add(angles)
+        return Physics(qpos, jnp.zeros(count + 6), jnp.zeros(count + 6))
+
+    def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
+        angles = symmetry.euler_of(physics.qpos[3:7])
+        velocity = physics.qvel[:3]
+        if self._in_heading:
+            velocity = symmetry.turn_vector(velocity, -angles[2])
+        place = (physics.qpos[7:] - self._middle) / self._reach
+        joints = jnp.stack([place, 0.1 * physics.qvel[6:]], axis=-1).reshape(-1)
+        touching = jnp.linalg.norm(contact[self._feet, 3:], axis=-1) > TOUCH
+        height = physics.qpos[2:3] - 0.8
+        s = jnp.concatenate([height, 0.3 * velocity, angles, joints, 1.0 * touching])
+        return jnp.clip(s, -5.0, 5.0)
+
+    def cost(self, state: State, action: jax.Array) -> jax.Array:
+        """What PyBullet charges for power, torque, and joints at their limits."""
+        joints = self.observation.part(state.observation, "joint angles, velocities")
+        place, rate = joints[..., 0::2], joints[..., 1::2]
+        power = self.electricity_cost * jnp.mean(jnp.abs(action * rate), axis=-1)
+        torque = self.torque_cost * jnp.mean(action**2, axis=-1)
+        return power + torque + self.limit_cost * jnp.sum(jnp.abs(place) > 0.99, axis=-1)
+
+
+def edited(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Brax's humanoid with PyBullet's motors, limits, time step and base; both sides alike."""
+    spec.option.timestep = Humanoid.control_step / 4
+    for side in ("right", "left"):
+        spec.joint(f"{side}_hip_y").range = HIP_RANGE
+        spec.joint(f"{side}_hip_y").armature = HIP_ARMATURE
+        spec.joint(f"{side}_knee").stiffness[0] = KNEE_STIFFNESS  # of a polynomial
+    for motor in list(spec.actuators):
+        spec.delete(motor)
+    for name, power in POWER.items():
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.gear[0] = STRENGTH * power
+        motor.ctrllimited, motor.ctrlrange = True, (-1.0, 1.0)
+    torso = spec.body("torso")
+    torso.pos = torso.pos + BASE
+    spans = [geom for geom in torso.geoms if np.isfinite(geom.fromto).all()]
+    for geom in spans:
+        geom.fromto = geom.fromto - np.tile(BASE, 2)
+    for part in (*torso.bodies, *torso.cameras, *(g for g in torso.geoms if g not in spans)):
+        part.pos = part.pos - BASE
+    return spec
