@@ -53,8 +53,8 @@ def chosen(options: Table) -> list[Direct | Inverse]:
     Raises:
       BadInput: there is no such method, or none is left.
     """
-    rows = [by_name(name) for name in dict.fromkeys(options.methods)]
-    rows = rows if options.extra else [row for row in rows if row not in EXTRA]
+    rows = [by_name(name, options.robot) for name in dict.fromkeys(options.methods)]
+    rows = rows if options.extra else [row for row in rows if row.name not in EXTRA]
     if not rows:
         raise BadInput(f"no method to run; there are: {', '.join(ORDER)}")
     return rows

@@ -1,7 +1,7 @@
 """The stages of a cell of Table 1, each skipped when it is done.
 
-    experience ──▶ replay (𝒢) ──▶ controller ──▶ test        Inverse methods
-    policy ─────────────────────────────────────▶ test        Direct methods
+    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        Inverse methods
+                                              policy ──────▶ test        Direct methods
 
 Every stage has a directory that the settings it depends on name, so methods that agree
 on a stage share it, and a run that was killed goes on where it was.
@@ -19,6 +19,8 @@ import jax
 import numpy as np
 
 from genidm import controller, experience, files
+from genidm.agents.base import Agent
+from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.policy import Policy
 from genidm.collect import collect, whole
 from genidm.config import plain
@@ -72,22 +74,22 @@ class Cell(abc.ABC, Generic[M]):
     def _key(self, stage: int) -> jax.Array:
         return jax.random.fold_in(jax.random.key(self.seed), stage)
 
-    def _learning(self) -> dict[str, Any]:
-        """The config of the stage in which the agent learns."""
-        m = self.method
+    def _learning(self, agent: Any, interactions: int) -> dict[str, Any]:
+        """The config of a stage in which an agent is at work."""
         return dict(
-            robot=self.robot.settings, agent=m.agent, task=m.task,
-            interactions=self.scale.interactions, seed=self.seed,
+            robot=self.robot.settings, agent=agent, task=self.method.task,
+            interactions=interactions, seed=self.seed,
         )  # fmt: skip
 
-    def _collect(self, stage: Stage, keep: bool = True) -> tuple[Any, Policy | None]:
-        """Lets the agent learn; what it saw, if that is kept, and the policy it ended with."""
-        m = self.method
+    def _collect(
+        self, stage: Stage, agent: Agent, interactions: int, keep: bool = True
+    ) -> tuple[Any, Policy | None]:
+        """Lets an agent work; what it saw, if that is kept, and the policy it ended with."""
+        task = self.method.task
         record, learner = collect(
-            self.robot, m.agent, self.scale.interactions, self.seed,
-            task=m.task, stage=stage, keep=keep,
-        )  # fmt: skip
-        return record, m.agent.policy(self.robot, m.task, learner)
+            self.robot, agent, interactions, self.seed, task=task, stage=stage, keep=keep
+        )
+        return record, agent.policy(self.robot, task, learner)
 
     def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
         """The test (A.1.3), and the ways of Fig. 8; returns the stage that holds them.
@@ -129,19 +131,39 @@ class InverseCell(Cell[Inverse]):
     @functools.cached_property
     def experience_stage(self) -> Stage:
         """Where the record lies; shared by all methods with the same agent."""
-        agent = type(self.method.agent).__name__
-        return Stage.open(self.root, f"experience-{agent}-{self.seed}", self._learning())
+        agent = self.method.agent
+        config = self._learning(agent, self.scale.interactions)
+        return Stage.open(self.root, f"experience-{type(agent).__name__}-{self.seed}", config)
 
     def experience(self) -> Experience:
         """What the agent saw while it learned (§4.1)."""
         stage = self.experience_stage
         if not stage.done:
-            record, policy = self._collect(stage)
+            agent, before = self._collector()
+            record, policy = self._collect(stage, agent, self.scale.interactions - before)
             if policy:
                 policy.save(stage.path("policy"), overwrite=True)
-            stage.finish({"interactions": record.interactions})
+            stage.finish({"interactions": before + record.interactions})
             return record
         return experience.load_chunks(stage.path("experience"), self.robot)
+
+    def _collector(self) -> tuple[Agent, int]:
+        """What collects, and for how many interactions it has learned before."""
+        frozen = self.method.agent
+        if not isinstance(frozen, Frozen):
+            return frozen, 0
+        interactions = whole(frozen.agent, round(frozen.share * self.scale.interactions))
+        config = self._learning(frozen.agent, interactions)
+        stage = Stage.open(self.root, f"agent-{type(frozen.agent).__name__}-{self.seed}", config)
+        if not stage.done:
+            _, policy = self._collect(stage, frozen.agent, interactions, keep=False)
+            assert policy  # both agents that can be frozen have one
+            policy.save(stage.path("policy"), overwrite=True)
+            stage.finish({"interactions": interactions})
+            stage.clear_checkpoints()
+        learned = controller.load(stage.path("policy"), self.robot)
+        assert isinstance(learned, Policy)
+        return Acting(frozen.agent, learned), interactions
 
     @functools.cached_property
     def replay_stage(self) -> Stage | None:
@@ -224,13 +246,14 @@ class DirectCell(Cell[Direct]):
 
     @functools.cached_property
     def controller_stage(self) -> Stage:
-        return Stage.open(self.root, self._label, self._learning())
+        config = self._learning(self.method.agent, self.scale.interactions)
+        return Stage.open(self.root, self._label, config)
 
     def controller(self) -> Steering:
         """The policy that the agent ended with."""
         stage, m = self.controller_stage, self.method
         if not stage.done:
-            _, policy = self._collect(stage, keep=False)
+            _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
             assert policy  # no Direct method has an agent that learns nothing
             policy.save(stage.path("controller"), overwrite=True)
             interactions = whole(m.agent, self.scale.interactions)

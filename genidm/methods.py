@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 
 from genidm.agents.ddpg import DDPG
+from genidm.agents.frozen import Frozen
 from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
@@ -31,7 +32,7 @@ class Method:
     """
 
     name: str
-    agent: PPO | SAC | DDPG | RandomActions
+    agent: PPO | SAC | DDPG | RandomActions | Frozen
     task: WalkForward | GoToGoal
 
 
@@ -96,23 +97,44 @@ VGCP = Direct(name="VGCP", agent=PPO(), task=GoToGoal())
 HER_SP = Direct(name="HER_SP", agent=SAC(her=HER()), task=GoToGoal(reward=Sparse()))
 HER_DE = Direct(name="HER_DE", agent=DDPG(her=HER()), task=GoToGoal(reward=Dense()))
 
-TABLE1: tuple[Direct | Inverse, ...] = (RS, RL, VGCP, HER_SP, HER_DE, GE, LR)
-"""The methods of the paper's Table 1, top to bottom."""
+Methods = tuple[Direct | Inverse, ...]
 
-EXTRA: tuple[Direct | Inverse, ...] = (HF,)
+ANT: Methods = (RS, RL, VGCP, HER_SP, HER_DE, GE, LR, HF)
+"""Table 1's rows for the Ant, and HF."""
+
+EXTRA = ("HF",)
 """Methods that the paper does not have."""
 
-ORDER = tuple(method.name for method in (*TABLE1, *EXTRA))
+ORDER = tuple(method.name for method in ANT)
 """Rows of the table, top to bottom; other names follow."""
 
 
-def by_name(name: str) -> Direct | Inverse:
-    """The method of that name.
+_WALKER = Frozen(SAC(hidden=(256, 256)), share=1 / 3)
+_LR_FIT = dataclasses.replace(LR.fit, idm=(256, 256), latent_size=50)
+
+HUMANOID: Methods = (
+    RS,
+    dataclasses.replace(RL, agent=_WALKER),
+    dataclasses.replace(VGCP, agent=SAC(hidden=(256, 256))),
+    HER_SP,
+    dataclasses.replace(HER_DE, agent=SAC(her=HER())),
+    dataclasses.replace(GE, agent=_WALKER),
+    dataclasses.replace(LR, agent=_WALKER, fit=_LR_FIT),
+    dataclasses.replace(HF, agent=_WALKER),
+)
+"""SAC learns for 5 M interactions, is frozen, and collects 10 M (A.1.2, Table 2)."""
+
+TABLES = {"ant": ANT, "humanoid": HUMANOID}
+"""Robot → the methods of its column. A robot without one has the Ant's."""
+
+
+def by_name(name: str, robot: str = "ant") -> Direct | Inverse:
+    """The method of that name, with its settings for a robot.
 
     Raises:
       BadInput: there is none.
     """
-    for method in (*TABLE1, *EXTRA):
+    for method in TABLES.get(robot, ANT):
         if method.name == name:
             return method
     raise BadInput(f"no method is called {name!r}; there are: {', '.join(ORDER)}")

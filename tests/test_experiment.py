@@ -42,7 +42,7 @@ from genidm.files import load_arrays, save_arrays
 from genidm.generalize import Generalize
 from genidm.methods import Inverse, Method, literal
 from genidm.progress import METRICS, Progress, read_metrics
-from genidm.robots import Ant
+from genidm.robots import Ant, Humanoid, Robot
 from genidm.scale import Scale, scale_of
 from genidm.scenarios import scenarios
 from genidm.store import Stage
@@ -256,10 +256,10 @@ def test_scales_are_shares_of_the_paper() -> None:
     this = cell(Point(), dataclasses.replace(LR, look_ahead=999), Options(scale="quick"))
     assert this.method.look_ahead == quick.look_ahead
     assert this.method.share == quick.share == 1.0
-    assert this.method.agent == quick.ppo != LR.agent
-    mine = dataclasses.replace(LR, agent=PPO(discount=0.9))
-    assert cell(Point(), mine, Options(scale="quick")).method.agent == mine.agent
-    assert cell(Point(), LR, Options(scale="paper")).method.agent == LR.agent
+    given = {name: cell(Point(), methods.LR, Options(scale=name)) for name in ("quick", "paper")}
+    assert given["quick"].method.agent == quick.ppo != methods.LR.agent
+    assert given["paper"].method.agent == methods.LR.agent
+    assert this.method.agent == LR.agent  # what a user has set stands
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
         with pytest.raises(BadInput, match="--scale"):
             scale_of(wrong, 2000)
@@ -348,11 +348,12 @@ def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch
 
 
 @pytest.mark.parametrize("name", methods.ORDER)
-def test_every_method_has_a_command(name: str, monkeypatch) -> None:
+@pytest.mark.parametrize("robot", [Ant, Humanoid])
+def test_every_method_has_a_command(robot: type[Robot], name: str, monkeypatch) -> None:
     asked: list = []
     monkeypatch.setattr(experiment, "main", lambda *args: asked.append(args))
-    runpy.run_module(f"experiments.ant_{name.lower()}", run_name="__main__")
-    assert asked == [(Ant, getattr(methods, name))]
+    runpy.run_module(f"experiments.{robot.name}_{name.lower()}", run_name="__main__")
+    assert asked == [(robot, methods.by_name(name, robot.name))]
 
 
 # ── bad input: one sentence on stderr, exit status 2, nothing overwritten ───────────────

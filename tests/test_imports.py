@@ -32,6 +32,7 @@ agents.base agents.her
 agents.alternating
 agents.off_policy
 agents.*
+agents.frozen
 agents
 collect
 generalize

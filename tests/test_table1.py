@@ -94,14 +94,16 @@ def counted(*names: str) -> Iterator[Counter]:
 
 
 def test_table1_has_the_papers_seven_methods_and_its_rows_one_more() -> None:
-    assert [m.name for m in methods.TABLE1] == ["RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR"]
-    assert (*(m.name for m in methods.TABLE1), "HF") == methods.ORDER
+    paper = ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR")
+    for column in methods.TABLES.values():
+        assert tuple(m.name for m in column) == (*paper, *methods.EXTRA) == methods.ORDER
     assert Table().methods == methods.ORDER
 
 
 def test_methods_are_chosen_by_name() -> None:
-    assert chosen(Table()) == [*methods.TABLE1, methods.HF]
-    assert chosen(Table(extra=False)) == list(methods.TABLE1)
+    assert chosen(Table()) == list(methods.ANT)
+    assert chosen(Table(robot="humanoid")) == list(methods.HUMANOID)
+    assert chosen(Table(extra=False)) == list(methods.ANT[:-1])
     assert chosen(Table(methods=("LR", "RS", "LR"))) == [methods.LR, methods.RS]
     with pytest.raises(BadInput, match="'XX'; there are: RS"):
         chosen(Table(methods=("RS", "XX")))
@@ -110,7 +112,7 @@ def test_methods_are_chosen_by_name() -> None:
 
 
 def test_methods_with_one_experience_follow_each_other() -> None:
-    order = [m.name for m in grouped([*methods.TABLE1, methods.HF])]
+    order = [m.name for m in grouped(methods.ANT)]
     assert order == ["RS", "RL", "GE", "LR", "HF", "VGCP", "HER_SP", "HER_DE"]
 
 

@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 from jax.sharding import Mesh
 
 from genidm import devices
+from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
 from genidm.evaluate import Test
-from genidm.methods import RL
 from genidm.robots import Robot
 
 T = TypeVar("T")
@@ -43,7 +43,7 @@ class Options:
     run: Path | None = None
     rows: tuple[str, ...] = ()
     seconds: float = 60.0
-    lanes: int = RL.agent.lanes
+    lanes: int = PPO().lanes
     wide: int = Test().lanes
     bank: tuple[int, int] = (10, 1000)
 

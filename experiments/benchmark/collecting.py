@@ -79,7 +79,8 @@ def writing(bench: Bench) -> Probe:
 
 def _agent(bench: Bench, method: Method) -> Any:
     """The method's agent, which learns from its first iteration on."""
-    agent = dataclasses.replace(method.agent, lanes=bench.options.lanes)
+    agent: Any = method.agent
+    agent = dataclasses.replace(agent, lanes=bench.options.lanes)
     return dataclasses.replace(agent, warmup=0) if isinstance(agent, OffPolicy) else agent
 
 

@@ -51,7 +51,8 @@ def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
 def start(robot: str) -> None:
     """In a fresh process: makes PPO's first iteration, and prints what was compiled."""
     with compiling() as counted:
-        collect(by_name(robot), RL.agent, 1, quiet=True)
+        agent: Any = RL.agent
+        collect(by_name(robot), agent, 1, quiet=True)
     print(json.dumps(counted))
 
 

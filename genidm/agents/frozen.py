@@ -1,0 +1,88 @@
+"""An agent that has learned, and learns no more: how the Humanoid collects (A.1.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.policy import Policy, no_statistics
+from genidm.agents.ppo import PPO
+from genidm.agents.sac import SAC
+from genidm.errors import BadInput
+from genidm.experience import Experience
+from genidm.progress import compiled
+from genidm.robots.base import Robot
+from genidm.tasks import Lanes, Task, input_size
+
+Learner = PPO | SAC
+
+
+@dataclasses.dataclass(frozen=True)
+class Frozen:
+    """Settings: the agent learns for a share of the interactions, of which nothing is kept.
+
+    The others are its record, made by the policy that it ended with, which still explores as
+    it did while it learned.
+
+    Attributes:
+      agent: what learns.
+      share: of the interactions that it learns from.
+    """
+
+    agent: Learner
+    share: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share < 1:
+            raise BadInput(f"a frozen agent learns for a share in (0, 1), not {self.share}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Acting:
+    """The agent that a frozen one is once it has learned.
+
+    Attributes:
+      agent: as which it explores.
+      learned: what it ended with.
+    """
+
+    agent: Learner
+    learned: Policy
+
+    @property
+    def lanes(self) -> int:
+        return self.agent.lanes
+
+    @property
+    def unroll(self) -> int:
+        return self.agent.unroll
+
+    def policy(self, robot: Robot, task: Task, learner: Any) -> Policy:
+        """The policy that it was given."""
+        return self.learned
+
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        """The first of the agent's two programs, again and again."""
+        stepping = self.agent.programs(robot, task, mesh).stepping
+        statistics = no_statistics(input_size(robot, task))
+        statistics = statistics.replace(mean=self.learned.mean, std=self.learned.std)
+        chosen = devices.put((statistics, self.learned.params), mesh, None)
+
+        def start(key: jax.Array) -> Lanes:
+            return task.start(robot, jax.random.split(key, self.lanes))
+
+        def prepare(lanes: Lanes) -> Iterate:
+            program = compiled("a frozen agent's stepping", stepping, *chosen, lanes)
+
+            def iterate(lanes: Lanes) -> tuple[Lanes, Experience, Metrics]:
+                lanes, experience, _, seen = program(*chosen, lanes)
+                return lanes, experience, seen
+
+            return iterate
+
+        return Learning(start, lambda lanes: devices.put(lanes, mesh), prepare)

@@ -1,0 +1,93 @@
+"""A frozen agent learns first and collects then; what it ended with is what acts."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from killing import Killed, dies_at
+from point import Point
+from tiny import AGENTS, TEST, tiny
+
+from genidm import collect as collecting
+from genidm import devices, methods
+from genidm.agents.frozen import Acting, Frozen
+from genidm.agents.ppo import PPO
+from genidm.agents.sac import SAC
+from genidm.collect import collect
+from genidm.errors import BadInput
+from genidm.experiment import Options, cell
+from genidm.progress import Progress
+from genidm.scenarios import scenarios
+from genidm.tasks import WalkForward
+
+TASK = WalkForward(episode_steps=20)
+LEARNER = dataclasses.replace(AGENTS[SAC], her=None)
+
+
+@pytest.mark.parametrize("agent", [AGENTS[PPO], LEARNER], ids=lambda a: type(a).__name__)
+def test_it_acts_as_it_had_learned_to(agent: PPO | SAC) -> None:
+    """The first program of an iteration, at the learner's end, is all that it does."""
+    robot, mesh = Point(), devices.mesh()
+    _, learner = collect(robot, agent, 1024, task=TASK, quiet=True)
+    learned = agent.policy(robot, TASK, learner)
+    acting = Acting(agent, learned)
+    learning = acting.learning(robot, TASK, mesh)
+    lanes = learning.place(learning.start(jax.random.key(3)))
+    programs = agent.programs(robot, TASK, mesh)
+    chosen = programs.acting(programs.place(learner).training)
+    after, expected, _, _ = programs.stepping(*chosen, jax.tree.map(jax.numpy.copy, lanes))
+    got_lanes, got, _ = learning.prepare(lanes)(lanes)
+    np.testing.assert_array_equal(got.a, expected.a)
+    np.testing.assert_array_equal(got.s, expected.s)
+    np.testing.assert_array_equal(got_lanes.robots.position, after.robots.position)
+    assert (
+        np.std(np.asarray(got.a) - learned(np.asarray(got.s), None)) > 0.05
+    )  # it explores as it did
+    assert acting.policy(robot, TASK, got_lanes) is learned
+
+
+@pytest.fixture(scope="module")
+def rl() -> methods.Inverse:
+    return tiny(methods.RL, agent=Frozen(LEARNER, share=0.5))
+
+
+def options(out: Path, **changes) -> Options:
+    return dataclasses.replace(Options(scale="0.5", out=out, episodes=2, test=TEST), **changes)
+
+
+def test_its_learning_is_counted_and_not_recorded(rl: methods.Inverse, tmp_path: Path) -> None:
+    this = cell(Point(), rl, options(tmp_path))
+    assert this.scale.interactions == 1024
+    this.episodes(scenarios(Point(), 10, 2))
+    summary = this.controller_stage.summary()
+    # Four iterations of 128 steps each.
+    assert (summary["interactions"], summary["learned_from"]) == (512 + 512, 512)
+    (stage,) = (tmp_path / "point").glob("agent-SAC-0-*")
+    assert json.loads((stage / "done.json").read_text()) == {"interactions": 512}
+    assert not (stage / "experience").exists() and not (stage / "checkpoints").exists()
+
+
+def test_killed_on_its_way_it_ends_with_the_same_bits(
+    rl: methods.Inverse, tmp_path: Path, monkeypatch
+) -> None:
+    whole = cell(Point(), rl, options(tmp_path / "whole")).experience()
+    monkeypatch.setattr(collecting, "CHUNK", 128)
+    for calls in (2, 4):  # while it learns, and while it is recorded
+        dying = cell(Point(), rl, options(tmp_path / "killed"))
+        with monkeypatch.context() as m:
+            m.setattr(Progress, "advance", dies_at(calls))
+            with pytest.raises(Killed):
+                dying.experience()
+    killed = cell(Point(), rl, options(tmp_path / "killed")).experience()
+    jax.tree.map(np.testing.assert_array_equal, killed, whole)
+
+
+def test_a_share_lies_between_0_and_1() -> None:
+    for wrong in (0.0, 1.0, -0.5, float("nan")):
+        with pytest.raises(BadInput, match="share"):
+            Frozen(LEARNER, wrong)
