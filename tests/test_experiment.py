@@ -34,7 +34,6 @@ from experiments import evaluate, walk
 from genidm import cells, controller, experiment, methods, stats
 from genidm import collect as collecting
 from genidm.agents.policy import Policy
-from genidm.agents.ppo import PPO
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.experiment import Options, cell, run_cell
