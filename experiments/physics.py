@@ -1,6 +1,7 @@
-"""How stable, how fast and how turnable the Ant's physics is, by solver settings.
+"""How stable, how fast and how turnable a robot's physics is, by solver settings.
 
     python -m experiments.physics                  # minutes; what it says is in docs/physics.md
+    python -m experiments.physics --robot humanoid
     python -m experiments.physics --steps 20000    # a glance
 
 Robots are shaken: every torque is at full strength, forwards or backwards at random, drawn
@@ -15,7 +16,7 @@ import math
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +30,10 @@ from genidm.config import environment
 from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.progress import Progress, compiled
-from genidm.robots import Ant, State
-from genidm.robots.mjx import Physics, Solver, select
+from genidm.robots import Ant, Humanoid, State
+from genidm.robots.mjx import MjxRobot, Physics, Solver, select
+
+ROBOTS = {"ant": Ant, "humanoid": Humanoid}
 
 OURS = Solver(iterations=4, line_search=8, elliptic=True)
 SETTINGS = (
@@ -53,18 +56,20 @@ class Options:
     """What is measured.
 
     Attributes:
+      robot: by its name.
       steps: control steps of elliptic 4/8; the other settings are given 0.128 of them.
       lanes: robots at once; a multiple of the number of devices.
       threads: of MuJoCo in C; as many as jax has devices, unless given.
       seed: of starts, actions and yaws.
-      out: the JSON file.
+      out: the JSON file; under experiments/results, unless given.
     """
 
+    robot: Literal["ant", "humanoid"] = "ant"
     steps: int = 1_000_000
     lanes: int = 128
     threads: int | None = None
     seed: int = 0
-    out: Path = Path("experiments/results/physics.json")
+    out: Path | None = None
 
     def check(self) -> None:
         """Raises BadInput for what cannot be measured."""
@@ -77,6 +82,10 @@ class Options:
     def pool(self) -> int:
         """Threads of MuJoCo in C."""
         return jax.device_count() if self.threads is None else self.threads
+
+    def with_solver(self, solver: Solver) -> MjxRobot:
+        """The robot, under these settings of the solver."""
+        return ROBOTS[self.robot](solver)
 
     def episodes(self, solver: Solver) -> int:
         """Episodes of every lane: the steps asked for, rounded up."""
@@ -95,7 +104,7 @@ def cone(solver: Solver) -> str:
 class InC:
     """Lanes in MuJoCo's C engine, in float64, on a pool of threads."""
 
-    def __init__(self, robot: Ant, threads: int = 1):
+    def __init__(self, robot: MjxRobot, threads: int = 1):
         self.model, self.frames = robot.mj_model, robot.frames
         self._pool = Rollout(nthread=threads)
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
@@ -133,7 +142,7 @@ def strong(rng: np.random.Generator, steps: int, lanes: int, size: int) -> np.nd
 # ── stability and speed ─────────────────────────────────────────────────────────────────────
 
 
-def endure_in_c(robot: Ant, name: str, episodes: int, options: Options) -> dict[str, float]:
+def endure_in_c(robot: MjxRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
     """Shakes lanes in C; one that blows up sits out the rest of its episode.
 
     Returns:
@@ -161,7 +170,7 @@ def endure_in_c(robot: Ant, name: str, episodes: int, options: Options) -> dict[
     return {"steps": steps, "blow_ups": blow_ups, "seconds": seconds}
 
 
-def endure_in_mjx(robot: Ant, name: str, episodes: int, options: Options) -> dict[str, float]:
+def endure_in_mjx(robot: MjxRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
     """Shakes lanes sharded over the devices; one that blows up starts afresh at once.
 
     Returns:
@@ -182,7 +191,7 @@ def endure_in_mjx(robot: Ant, name: str, episodes: int, options: Options) -> dic
     return {"steps": episodes * EPISODE * options.lanes, "blow_ups": blow_ups, "seconds": seconds}
 
 
-def shaken(robot: Ant) -> Any:
+def shaken(robot: MjxRobot) -> Any:
     """A function of keys `[B]`: blow-ups `[B]` in an episode from fresh starts."""
 
     def action(key: jax.Array) -> jax.Array:
@@ -205,7 +214,7 @@ def stability(options: Options) -> list[dict[str, Any]]:
     """A row for each setting and engine."""
     rows = []
     for solver in SETTINGS:
-        robot, episodes = Ant(solver), options.episodes(solver)
+        robot, episodes = options.with_solver(solver), options.episodes(solver)
         for engine, endure in (("MJX float32", endure_in_mjx), ("C float64", endure_in_c)):
             setting = f"{cone(solver)} {solver.iterations}/{solver.line_search}"
             row = endure(robot, f"{setting} {engine}", episodes, options)
@@ -219,7 +228,7 @@ def stability(options: Options) -> list[dict[str, Any]]:
 
 def starts(options: Options) -> Physics:
     """Physics `[B, ...]` of robots that have been shaken for a second, in float32's numbers."""
-    robot, rng = Ant(OURS), np.random.default_rng(options.seed)
+    robot, rng = options.with_solver(OURS), np.random.default_rng(options.seed)
     keys = jax.random.split(jax.random.key(options.seed), options.lanes)
     fresh = robot.reset(keys, jnp.zeros(options.lanes)).physics
     engine = InC(robot)
@@ -229,7 +238,7 @@ def starts(options: Options) -> Physics:
     return Physics(qpos, qvel, np.zeros_like(qvel))
 
 
-def drift_in_c(robot: Ant, start: Physics, yaw: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def drift_in_c(robot: MjxRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """Metres `[T, B]` between the turned replay and the replay, turned; in float64."""
     engine = InC(robot)
     with jax.enable_x64(True):  # the turns, too
@@ -240,7 +249,9 @@ def drift_in_c(robot: Ant, start: Physics, yaw: np.ndarray, actions: np.ndarray)
         return np.linalg.norm(engine.positions(turned, actions) - np.asarray(exact), axis=-1)
 
 
-def drift_in_mjx(robot: Ant, start: Physics, yaw: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def drift_in_mjx(
+    robot: MjxRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray
+) -> np.ndarray:
     """The same in MJX and float32, as 𝒢 does it."""
 
     def positions(physics: Physics, yaw: jax.Array, actions: jax.Array) -> jax.Array:
@@ -262,8 +273,8 @@ def drift(options: Options) -> list[dict[str, Any]]:
     yaw = rng.uniform(-np.pi, np.pi, options.lanes)
     rows = []
     for solver in (s for s in SETTINGS if s.iterations == OURS.iterations):
-        robot = Ant(solver)
-        actions = strong(np.random.default_rng(options.seed + 2), max(LOOK), options.lanes, 8)
+        robot, shakes = options.with_solver(solver), np.random.default_rng(options.seed + 2)
+        actions = strong(shakes, max(LOOK), options.lanes, robot.action.size)
         for engine, replay in (("MJX float32", drift_in_mjx), ("C float64", drift_in_c)):
             apart = replay(robot, start, yaw, actions)[np.array(LOOK) - 1]
             rows.append(
@@ -327,9 +338,10 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
         "drift": turned,
         **environment(),
     }
-    files.save_json(options.out, results)
+    out = options.out or Path(f"experiments/results/{options.robot}_physics.json")
+    files.save_json(out, results)
     print(f"{stability_table(stable)}\n\n{drift_table(turned)}")
 
 
 if __name__ == "__main__":
-    guarded(physics, "Stability, speed and turnability of the Ant's physics.")
+    guarded(physics, "Stability, speed and turnability of a robot's physics.")
