@@ -41,12 +41,12 @@ controller
 fit
 scenarios
 evaluate
-invariance
+invariance waypoints
 stats
 report.paper
 report.rows
 report.table report.drawing
-report.figures
+report.figures report.journeys
 report
 methods scale
 cells
@@ -150,4 +150,4 @@ def test_a_back_edge_is_seen_however_it_is_written(source: str, edges: list[str]
 
 def test_a_module_without_a_place_is_an_error() -> None:
     with pytest.raises(LookupError, match="give it one"):
-        back_edges({"waypoints": "import genidm.store"})
+        back_edges({"homeless": "import genidm.store"})

@@ -9,6 +9,7 @@ from genidm.report.figures import (
     residuals,
     violins,
 )
+from genidm.report.journeys import journeys
 from genidm.report.paper import TABLE1
 from genidm.report.rows import Row, results
 from genidm.report.table import markdown, text
@@ -18,6 +19,7 @@ __all__ = [
     "Row",
     "bearings",
     "invariance",
+    "journeys",
     "latent_sizes",
     "learning_curves",
     "markdown",

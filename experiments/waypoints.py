@@ -1,0 +1,83 @@
+"""Fig. 7: `python -m experiments.waypoints runs/ant/LR-0-… runs/ant/VGCP-0-…`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from genidm import controller, files
+from genidm.config import environment
+from genidm.errors import BadInput
+from genidm.experiment import guarded
+from genidm.report import journeys
+from genidm.report.rows import jsonable
+from genidm.store import Stage
+from genidm.waypoints import Follow, Journeys, follow
+
+# Metres. It goes ahead, turns both ways, and comes back facing where it started from.
+LOOP = ((3.0, 0.0), (5.0, 2.0), (4.0, 5.0), (0.0, 5.0), (-2.0, 2.0))
+
+
+def main(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    waypoints: tuple[tuple[float, float], ...] = LOOP,
+    robots: int = 10,
+    yaw: float = 0.0,
+    seed: int = 0,
+    out: Path = Path("waypoints"),
+    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),  # noqa: B008
+) -> None:
+    """Leads robots through waypoints, one controller after another from the same starts.
+
+    Args:
+      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --out.
+      waypoints: x and y of each, metres; starts are near the origin.
+      robots: journeys of each controller.
+      yaw: radians, that the starts are turned by.
+      seed: of the starts.
+      out: directory that gets the figure and the numbers.
+      settings: of a journey.
+
+    Raises:
+      BadInput: runs of different robots, or none.
+    """
+    if not runs or robots < 1:
+        raise BadInput("waypoints need a run, and a robot, at least")
+    keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
+    made: dict[str, Journeys] = {}
+    names = set()
+    for run in runs:
+        model = controller.load(run / "controller")
+        names.add(model.robot.name)
+        if len(names) > 1:
+            raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(names))}")
+        name = Stage(run).summary()["method"]
+        name = name if name not in made else f"{name}, {run.name}"
+        points = np.asarray(waypoints)
+        made[name] = follow(model.robot, model, points, keys, turned, settings=settings)
+        print(f"{name}: {sentence(made[name])}")
+    summary = {name: one.summary() for name, one in made.items()}
+    written = {"waypoints": waypoints, "methods": jsonable(summary, digits=4), **environment()}
+    files.save_json(out / f"{names.pop()}_waypoints.json", written)
+    journeys(made, settings.reach, out / "waypoints.png")
+
+
+def sentence(made: Journeys) -> str:
+    """What became of the journeys, in words."""
+    found = made.summary()
+    whole = made.times[np.isfinite(made.times).all(1), -1]
+    took = f", in {whole.mean():.1f} s" if len(whole) else ""
+    return (
+        f"{len(whole)} of {found['journeys']} through all waypoints{took}; "
+        f"{found['deviation']:.2f} m from the path, body {np.degrees(found['askew'] or 0):.0f}° "
+        f"from its course, {found['fell']:.0%} fell"
+    )
+
+
+if __name__ == "__main__":
+    guarded(main, "Through waypoints.")

@@ -1,0 +1,274 @@
+"""Through waypoints (§5.3, Fig. 7): a planner says where to go, the controller goes there."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.errors import BadInput
+from genidm.evaluate import Steering
+from genidm.progress import Progress, compiled
+from genidm.robots.base import Robot, State, select
+from genidm.symmetry import horizontal
+
+# (o [B, 3], waypoints [W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
+# metres, world frame; asked anew at each step.
+Planner = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+def straight(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
+    """Straight to the first waypoint that is left; to the last one when none is."""
+    first = jnp.where(left.any(-1), jnp.argmax(left, axis=-1), waypoints.shape[0] - 1)
+    return waypoints[first]
+
+
+@dataclasses.dataclass(frozen=True)
+class Follow:
+    """Settings of a journey.
+
+    Attributes:
+      max_steps: it ends after this many steps.
+      reach: metres, horizontal; a waypoint is reached when it is this near and its turn.
+      chunk: steps a program call.
+    """
+
+    max_steps: int = 2000
+    reach: float = 0.25
+    chunk: int = 50
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1 or self.chunk < 1 or self.reach <= 0:
+            raise BadInput("a journey needs max_steps and chunk ≥ 1, and a reach above 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class Journeys:
+    """B journeys through W waypoints, over T steps at most.
+
+    Attributes:
+      waypoints: `[W, 3]`, metres.
+      position: `[B, T + 1, 3]`, metres; of a journey that is over, where it ended.
+      heading: `[B, T + 1]`, radians.
+      steps: `[B]`, that were made.
+      arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
+      fell: `[B]` bool; ended by a fall, or by physics that diverged.
+      control_step: seconds.
+    """
+
+    waypoints: np.ndarray
+    position: np.ndarray
+    heading: np.ndarray
+    steps: np.ndarray
+    arrival: np.ndarray
+    fell: np.ndarray
+    control_step: float
+
+    @property
+    def made(self) -> np.ndarray:
+        """`[B, T + 1]` bool, whether the journey was still going on."""
+        return np.arange(self.position.shape[1]) <= self.steps[:, None]
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds to each waypoint `[B, W]`; NaN where it was not reached."""
+        return np.where(self.arrival < 0, np.nan, self.arrival * self.control_step)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Metres `[B, T + 1]` from the leg that the robot was on; NaN after the end.
+
+        A leg is the straight line from the last waypoint, at first the start, to the next.
+        """
+        corners = self._corners()
+        begin, end = (np.take_along_axis(corners, self._leg(k), axis=1) for k in (0, 1))
+        way, along = self.position[..., :2] - begin, end - begin
+        length = np.maximum((along**2).sum(-1), 1e-12)
+        share = np.clip((way * along).sum(-1) / length, 0.0, 1.0)
+        apart = np.linalg.norm(way - share[..., None] * along, axis=-1)
+        return np.where(self.made, apart, np.nan)
+
+    @property
+    def askew(self) -> np.ndarray:
+        """Radians `[B, T]` between the heading and the motion; NaN where there is none."""
+        motion = np.diff(self.position[..., :2], axis=1)
+        course = np.arctan2(motion[..., 1], motion[..., 0])
+        angle = np.abs((self.heading[:, :-1] - course + np.pi) % (2 * np.pi) - np.pi)
+        moves = self.made[:, 1:] & (np.linalg.norm(motion, axis=-1) > 1e-3)
+        return np.where(moves, angle, np.nan)
+
+    def summary(self) -> dict[str, Any]:
+        """Means over the journeys: metres, seconds, radians, shares of the journeys."""
+        reached = self.arrival >= 0
+        times = [t[np.isfinite(t)] for t in self.times.T]
+        return {
+            "journeys": len(self.steps),
+            "deviation": float(np.nanmean(self.deviation)),
+            "askew": float(np.nanmean(self.askew)) if np.isfinite(self.askew).any() else None,
+            "reached": reached.mean(0).tolist(),
+            "seconds": [float(t.mean()) if len(t) else None for t in times],
+            "fell": float(self.fell.mean()),
+        }
+
+    def _corners(self) -> np.ndarray:
+        """The start and the waypoints `[B, W + 1, 2]`."""
+        starts = self.position[:, :1, :2]
+        points = np.broadcast_to(self.waypoints[None, :, :2], (len(starts), *self._shape))
+        return np.concatenate([starts, points], axis=1)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return len(self.waypoints), 2
+
+    def _leg(self, end: int) -> np.ndarray:
+        """Index `[B, T + 1, 1]` of a leg's beginning (0) or end (1) among the corners."""
+        step = np.arange(self.position.shape[1])
+        arrived = (self.arrival[:, None] >= 0) & (self.arrival[:, None] < step[:, None])
+        return np.minimum(arrived.sum(-1), len(self.waypoints) - 1)[..., None] + end
+
+
+class Walker(flax.struct.PyTreeNode):
+    """Robots on their way: State `[B]`, arrivals `[B, W]`, steps `[B]`, and whether they go on."""
+
+    robots: State
+    arrival: jax.Array
+    steps: jax.Array
+    going: jax.Array
+
+
+def follow(
+    robot: Robot,
+    controller: Steering,
+    waypoints: np.ndarray,
+    keys: jax.Array,
+    yaw: jax.Array,
+    planner: Planner = straight,
+    settings: Follow | None = None,
+    *,
+    mesh: Mesh | None = None,
+    quiet: bool = False,
+) -> Journeys:
+    """Leads robots through waypoints, each in its turn.
+
+    Args:
+      robot: what walks.
+      controller: what steers it; it is given the way to where the planner says.
+      waypoints: `[W, 2]` or `[W, 3]`, metres; without a height they have a standing robot's.
+      keys: `[B]`, of the starts.
+      yaw: `[B]`, radians, that the starts are turned by.
+      planner: where to go next; straight to the next waypoint, unless given.
+      settings: length of a journey, reach.
+      mesh: devices to share the robots among; all, unless given.
+      quiet: no progress bar.
+
+    Raises:
+      BadInput: no waypoints, or not of two or three finite numbers each.
+    """
+    settings, mesh = settings or Follow(), mesh or devices.mesh()
+    points = jnp.asarray(_checked(waypoints, robot.standing_height), jnp.float32)
+    walker = _start(robot, len(points), keys, yaw, mesh)
+    controller = devices.put(controller, mesh, None)
+    body = functools.partial(_chunk, robot, planner, settings, points)
+    sharded = devices.over_lanes(body, mesh, [None, 0], (0, 1))
+    step = compiled("waypoints", jax.jit(sharded, donate_argnums=1), controller, walker)
+    seen = [jax.tree.map(lambda x: np.asarray(x)[None], _seen(walker))]
+    with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
+        for made in range(0, settings.max_steps, settings.chunk):
+            walker, way = step(controller, walker)
+            seen.append(jax.tree.map(np.asarray, way))
+            bar.advance(min(settings.chunk, settings.max_steps - made))
+            if not np.asarray(walker.going).any():
+                break
+    return _journeys(robot, points, walker, seen, len(yaw))
+
+
+def _start(robot: Robot, waypoints: int, keys: jax.Array, yaw: jax.Array, mesh: Mesh) -> Walker:
+    """Robots at their starts; some twice, where the devices could not share them evenly."""
+    fill = np.arange(-(-len(yaw) // mesh.size) * mesh.size) % len(yaw)
+    walker = Walker(
+        robots=jax.jit(robot.reset)(keys[fill], jnp.asarray(yaw, jnp.float32)[fill]),
+        arrival=jnp.full((len(fill), waypoints), -1, jnp.int32),
+        steps=jnp.zeros(len(fill), jnp.int32),
+        going=jnp.ones(len(fill), bool),
+    )
+    return devices.put(walker, mesh)
+
+
+def _seen(walker: Walker) -> tuple[jax.Array, jax.Array]:
+    return walker.robots.position, walker.robots.heading
+
+
+def _journeys(
+    robot: Robot, points: jax.Array, walker: Walker, seen: list[tuple[Any, Any]], count: int
+) -> Journeys:
+    """What has become of the first `count` robots, seen `[steps, B, ...]` again and again."""
+    position, heading = (np.concatenate(part).swapaxes(0, 1) for part in zip(*seen, strict=True))
+    steps = np.asarray(walker.steps)[:count]
+    end = steps.max() + 1  # the last chunk may go on beyond it
+    robots = walker.robots
+    return Journeys(
+        waypoints=np.asarray(points),
+        position=position[:count, :end],
+        heading=heading[:count, :end],
+        steps=steps,
+        arrival=np.asarray(walker.arrival)[:count],
+        fell=np.asarray(robots.fallen | robots.diverged)[:count],
+        control_step=robot.control_step,
+    )
+
+
+def _checked(waypoints: Any, height: float) -> np.ndarray:
+    """Waypoints `[W, 3]`; raises BadInput for what is none."""
+    points = np.asarray(waypoints, float)
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
+        raise BadInput(f"waypoints are rows of two or three numbers, not of shape {points.shape}")
+    if not np.isfinite(points).all():
+        raise BadInput("waypoints must be finite numbers")
+    level = np.full((len(points), 1), height)
+    return points if points.shape[1] == 3 else np.concatenate([points, level], axis=1)
+
+
+def _chunk(
+    robot: Robot,
+    planner: Planner,
+    settings: Follow,
+    points: jax.Array,
+    controller: Steering,
+    walker: Walker,
+) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
+    """`settings.chunk` steps; and position `[chunk, B, 3]` and heading `[chunk, B]` after each."""
+
+    def step(walker: Walker, _: None) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
+        walker = _step(robot, planner, settings, points, controller, walker)
+        return walker, _seen(walker)
+
+    return jax.lax.scan(step, walker, length=settings.chunk)
+
+
+def _step(
+    robot: Robot,
+    planner: Planner,
+    settings: Follow,
+    points: jax.Array,
+    controller: Steering,
+    walker: Walker,
+) -> Walker:
+    """One step of the robots that still go; the others stay as they are."""
+    o, left = walker.robots.position, walker.arrival < 0
+    target = planner(o, points, left)
+    after = robot.step(walker.robots, controller(walker.robots.observation, target - o))
+    steps = walker.steps + 1
+    turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
+    near = horizontal(points - after.position[:, None]) <= settings.reach
+    arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
+    over = after.fallen | after.diverged | (arrival >= 0).all(-1) | (steps >= settings.max_steps)
+    new = Walker(after, arrival, steps, ~over)
+    return select(walker.going, new, walker)

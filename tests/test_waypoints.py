@@ -1,0 +1,133 @@
+"""Journeys through waypoints, on a point whose every journey has a closed form."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point import Point, Straight
+
+from genidm import devices
+from genidm.errors import BadInput
+from genidm.report.journeys import journeys
+from genidm.waypoints import Follow, Journeys, follow, straight
+
+WAYPOINTS = np.array([[2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+SETTINGS = Follow(max_steps=300, reach=0.2, chunk=40)
+COUNT = 5
+
+
+def journey(robot: Point, pace: float = 1.0, **changes) -> Journeys:
+    keys, yaw = jax.random.split(jax.random.key(0), COUNT), jnp.linspace(-1, 1, COUNT)
+    given = dict(waypoints=WAYPOINTS, settings=SETTINGS) | changes
+    return follow(
+        robot, Straight(jnp.float32(pace), robot), keys=keys, yaw=yaw, quiet=True, **given
+    )
+
+
+@pytest.fixture(scope="module")
+def made() -> Journeys:
+    return journey(Point())
+
+
+def one_way(start: np.ndarray, step: float, reach: float) -> tuple[list[np.ndarray], list[int]]:
+    """Positions after each step straight at the waypoint whose turn it is, and arrivals."""
+    o, way, arrivals = start.copy(), [start.copy()], []
+    for t in range(1, SETTINGS.max_steps + 1):
+        to = WAYPOINTS[len(arrivals)] - o
+        o = o + step * to / np.linalg.norm(to)
+        way.append(o.copy())
+        if np.linalg.norm(WAYPOINTS[len(arrivals)] - o) <= reach:
+            arrivals.append(t)
+        if len(arrivals) == len(WAYPOINTS):
+            break
+    return way, arrivals
+
+
+def test_every_journey_is_the_closed_form(made: Journeys) -> None:
+    for i in range(COUNT):
+        way, arrivals = one_way(np.float64(made.position[i, 0, :2]), 0.05, SETTINGS.reach)
+        assert made.arrival[i].tolist() == arrivals and made.steps[i] == arrivals[-1]
+        np.testing.assert_allclose(made.position[i, : len(way), :2], way, atol=1e-4)
+        after = made.position[i, len(way) :]
+        np.testing.assert_array_equal(
+            after, np.broadcast_to(made.position[i, len(way) - 1], after.shape)
+        )
+    assert not made.fell.any() and made.position.shape[1] == made.steps.max() + 1
+    np.testing.assert_allclose(made.times, 0.05 * made.arrival)
+
+
+def test_deviation_is_the_distance_from_the_leg(made: Journeys) -> None:
+    for i in range(COUNT):
+        corners = np.concatenate([made.position[i, :1, :2], WAYPOINTS])
+        for t in range(made.steps[i] + 1):
+            leg = int(np.sum(made.arrival[i] < t))
+            dense = np.linspace(corners[leg], corners[leg + 1], 20001)
+            apart = np.linalg.norm(dense - made.position[i, t, :2], axis=1).min()
+            assert made.deviation[i, t] == pytest.approx(apart, abs=2e-3)
+        assert np.isnan(made.deviation[i, made.steps[i] + 1 :]).all()
+    # A robot that turns at 0.2 m before a corner has left the leg there, and never further.
+    assert 0.1 < np.nanmax(made.deviation) <= SETTINGS.reach + 1e-6
+
+
+def test_askew_is_between_heading_and_course(made: Journeys) -> None:
+    i, t = 2, 30
+    step = made.position[i, t + 1] - made.position[i, t]
+    expected = abs(math.remainder(made.heading[i, t] - math.atan2(step[1], step[0]), 2 * math.pi))
+    assert made.askew[i, t] == pytest.approx(expected, abs=1e-5)
+    assert np.isnan(made.askew[i, made.steps[i] :]).all()
+
+
+def test_the_number_of_devices_changes_nothing(made: Journeys) -> None:
+    alone = journey(Point(), mesh=devices.mesh(jax.devices()[:1]))
+    np.testing.assert_array_equal(alone.arrival, made.arrival)
+    np.testing.assert_allclose(alone.position, made.position, atol=1e-5)
+
+
+def test_who_falls_or_is_late_has_reached_what_it_has_reached() -> None:
+    fallen = journey(Point(falls_at=2.1))
+    assert (
+        fallen.fell.all()
+        and (fallen.arrival[:, 0] > 0).all()
+        and (fallen.arrival[:, 1] == -1).all()
+    )
+    late = journey(Point(), settings=Follow(max_steps=60, reach=0.2, chunk=40))
+    assert (late.steps == 60).all() and not late.fell.any() and late.position.shape[1] == 61
+    assert np.isnan(late.times[:, 1:]).all()
+    found = late.summary()
+    assert found["reached"] == [1.0, 0.0, 0.0] and found["seconds"][1] is None
+    assert found["deviation"] < 0.2 and found["journeys"] == COUNT
+
+
+def test_any_planner_will_do() -> None:
+    """One that goes round the outside of each corner."""
+
+    def outside(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
+        return straight(o, waypoints, left) + jnp.asarray([0.1, 0.0, 0.0])
+
+    there = journey(Point(), planner=outside)
+    assert (there.arrival > 0).all() and there.position[..., 0].max() > 2.0
+
+
+def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
+    level = journey(Point(), waypoints=np.c_[WAYPOINTS, [0.5] * 3])
+    np.testing.assert_array_equal(level.waypoints[:, 2], 0.5)
+    for wrong in (np.zeros((0, 2)), np.zeros(3), [[1.0, np.nan]], np.zeros((2, 4))):
+        with pytest.raises(BadInput, match="waypoints"):
+            journey(Point(), waypoints=wrong)
+    with pytest.raises(BadInput, match="reach above 0"):
+        Follow(reach=0.0)
+
+
+def test_the_figure_shows_every_method(made: Journeys, tmp_path: Path) -> None:
+    fig = journeys({"LR": made, "VGCP": made}, SETTINGS.reach, tmp_path / "w.png")
+    assert (tmp_path / "w.png").stat().st_size > 10_000
+    above = fig.axes[0]
+    assert above.get_title() == "LR"
+    assert {text.get_text() for text in above.texts} == {"1", "2", "3"}
+    ways = [line for line in above.lines if line.get_linestyle() == "-"]
+    assert len(ways) == COUNT
