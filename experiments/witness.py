@@ -73,14 +73,20 @@ class GoalAnt(gymnasium.Wrapper):
 
     def step(self, action: np.ndarray) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
         observation, _, fallen, late, info = self.env.step(action)
-        seen = self._seen(observation)
+        seen, info = self._seen(observation), info | {"fallen": fallen}
         reward = float(self.compute_reward(seen["achieved_goal"], self.goal, info))
         return seen, reward, fallen or reward == 0.0, late, info
 
-    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, _: Any) -> np.ndarray:
-        """0 within reach, −1 otherwise (A.1.1), `[...]`; HER asks for it again."""
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, infos: Any) -> np.ndarray:
+        """0 within reach, −1 otherwise (A.1.1), `[...]`; HER asks for it again.
+
+        A fall ends the episode, and is charged −1 for ever: with less to pay it would be best
+        to fall at once.
+        """
+        fallen = np.array([info["fallen"] for info in np.atleast_1d(infos)])
         far = np.linalg.norm(achieved - desired, axis=-1)
-        return np.where(far <= self.task.reach, 0.0, -1.0)
+        charge = np.where(fallen, -1 / (1 - HER_SP.agent.discount), -1.0)
+        return np.where(far <= self.task.reach, 0.0, charge.reshape(far.shape))
 
     def _seen(self, observation: np.ndarray) -> Seen:
         position = self.env.unwrapped.data.qpos[:2].copy()
@@ -134,6 +140,7 @@ def learner(env: GoalAnt, seed: int) -> Any:
         replay_buffer_class=sb3.HerReplayBuffer,
         replay_buffer_kwargs={
             "n_sampled_goal": ours.her.goals, "goal_selection_strategy": ours.her.strategy,
+            "copy_info_dict": True,
         },
         policy_kwargs={
             "net_arch": {"pi": list(ours.hidden), "qf": list(ours.critic_hidden)},

@@ -64,8 +64,21 @@ def test_reward_is_that_of_the_goal(ant: Any) -> None:
     ant.goal = ant.unwrapped.data.qpos[:2] + 0.05
     *_, reward, ended, late, _ = ant.step(np.zeros(8))
     assert (reward, ended, late) == (0.0, True, False)
-    many = ant.compute_reward(np.zeros((3, 2)), np.array([[0.0, 0.0], [0.09, 0], [0.0, 0.11]]), {})
-    np.testing.assert_array_equal(many, [0, 0, -1])
+    goals = np.array([[0.0, 0.0], [0.09, 0.0], [0.0, 0.11], [0.0, 0.11], [0.09, 0.0]])
+    infos = [{"fallen": fallen} for fallen in (False, False, False, True, True)]
+    many = ant.compute_reward(np.zeros((5, 2)), goals, infos)
+    # −1 now and for ever, at a discount of 0.98.
+    np.testing.assert_allclose(many, [0, 0, -1, -50, 0])
+
+
+def test_a_fall_is_charged_for_ever(ant: Any) -> None:
+    ant.reset(seed=0)
+    state = ant.unwrapped.data.qpos.copy()
+    state[2] = 5.0  # above the healthy height
+    ant.unwrapped.set_state(state, ant.unwrapped.data.qvel)
+    *_, reward, ended, late, info = ant.step(np.zeros(8))
+    assert ended and not late and info["fallen"]
+    assert reward == pytest.approx(-50)
 
 
 def test_it_learns_and_is_tested(tmp_path: Path) -> None:
