@@ -63,8 +63,9 @@ def main(
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}
     written = {"waypoints": waypoints, "methods": jsonable(summary, digits=4), **environment()}
-    files.save_json(out / f"{names.pop()}_waypoints.json", written)
-    journeys(made, settings.reach, out / "waypoints.png")
+    name = f"{names.pop()}_waypoints"
+    files.save_json(out / f"{name}.json", written)
+    journeys(made, settings.reach, out / f"{name}.png")
 
 
 def sentence(made: Journeys) -> str:

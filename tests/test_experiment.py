@@ -30,7 +30,7 @@ from killing import Killed, dies_at
 from point import Point
 from tiny import TEST, tiny
 
-from experiments import evaluate, walk
+from experiments import evaluate, walk, waypoints
 from genidm import cells, controller, experiment, methods, stats
 from genidm import collect as collecting
 from genidm.agents.policy import Policy
@@ -46,6 +46,7 @@ from genidm.scale import Scale, scale_of
 from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import WalkForward
+from genidm.waypoints import Follow
 
 
 def small(method: Inverse) -> Inverse:
@@ -334,6 +335,20 @@ def test_it_is_tested_again_like_any_controller(direct: Finished, capsys, monkey
     mean = direct.results["methods"]["VGCP"]["mean"]
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("VGCP"))
     assert f"{mean:.2f}" in row
+
+
+def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(controller, "by_name", lambda name: {"point": Point()}[name])
+    runs = (stage_of(direct.out, "VGCP"),) * 2
+    waypoints.main(runs, robots=2, out=tmp_path, settings=Follow(max_steps=20, chunk=10))
+    written = json.loads((tmp_path / "point_waypoints.json").read_text())
+    assert list(written["methods"]) == ["VGCP", f"VGCP, {runs[0].name}"]
+    one, again = written["methods"].values()
+    assert one == again and one["journeys"] == 2 and len(one["reached"]) == 5
+    assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
+    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
+    with pytest.raises(BadInput, match="a run"):
+        waypoints.main((), out=tmp_path)
 
 
 def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:
