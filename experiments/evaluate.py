@@ -33,7 +33,7 @@ def main(
       test: settings of the test.
     """
     fitted = Stage(run).summary()
-    model = controller.load(run / "controller")
+    model = controller.load(run)
     bank = scenarios(model.robot, seeds, episodes, first_seed)
     row = Row(
         method=fitted["method"],

@@ -29,7 +29,7 @@ def main(
     robots: int = 10,
     yaw: float = 0.0,
     seed: int = 0,
-    out: Path = Path("waypoints"),
+    out: Path = Path("runs/waypoints"),
     settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),  # noqa: B008
 ) -> None:
     """Leads robots through waypoints, one controller after another from the same starts.
@@ -46,13 +46,15 @@ def main(
     Raises:
       BadInput: runs of different robots, or none.
     """
-    if not runs or robots < 1:
-        raise BadInput("waypoints need a run, and a robot, at least")
+    if not runs:
+        raise BadInput("waypoints need the directory of a run: METHOD-SEED-… under --out of a cell")
+    if robots < 1:
+        raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
     made: dict[str, Journeys] = {}
     names = set()
     for run in runs:
-        model = controller.load(run / "controller")
+        model = controller.load(run)
         names.add(model.robot.name)
         if len(names) > 1:
             raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(names))}")
@@ -66,6 +68,7 @@ def main(
     name = f"{names.pop()}_waypoints"
     files.save_json(out / f"{name}.json", written)
     journeys(made, settings.reach, out / f"{name}.png")
+    print(f"Numbers and figure: {out / name}.json, .png")
 
 
 def sentence(made: Journeys) -> str:

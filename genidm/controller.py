@@ -104,13 +104,16 @@ def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
     """A saved controller, fitted or learned.
 
     Args:
-      path: what `Controller.save` or `Policy.save` wrote.
-      robot: whose controller it is; found by its name, unless given.
+      path: what `Controller.save` or `Policy.save` wrote, or the directory of the run
+        (METHOD-SEED-…) that it lies in.
+      robot: whose controller it is; found by its name among those that come with genidm,
+        unless given.
 
     Raises:
       BadInput: the directory is torn, or the controller is another robot's.
     """
-    tree, meta = files.load_arrays(path)
+    inside = Path(path) / "controller"
+    tree, meta = files.load_arrays(inside if inside.is_dir() else path)
     if tree.keys() != {"params", "mean", "std"}:
         raise BadInput(f"{path} holds no controller")
     robot = robot or by_name(meta["robot"])

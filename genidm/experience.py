@@ -66,9 +66,12 @@ class Experience(flax.struct.PyTreeNode):
         """Refuses a record that cannot be learned from.
 
         Raises:
-          BadInput: the shapes do not fit together or the robot, or numbers are not finite.
+          BadInput: the shapes do not fit together or the robot, numbers are not finite, actions
+            lie outside [−1, 1], or flags are not bool.
         """
-        lanes = self.first.shape
+        lanes = np.shape(self.first)
+        if len(lanes) != 2:
+            raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
         sizes = {"s": (state_size,), "o": (3,), "o_next": (3,), "a": (action_size,)}
         for name, size in (sizes | {"last": (), "valid": ()}).items():
             shape = np.shape(getattr(self, name))
@@ -77,6 +80,11 @@ class Experience(flax.struct.PyTreeNode):
         for name in (*sizes, "physics"):
             if not all(np.isfinite(x).all() for x in jax.tree.leaves(getattr(self, name))):
                 raise BadInput(f"experience: {name} holds NaN or infinity")
+        for name in ("first", "last", "valid"):
+            if getattr(self, name).dtype != bool:
+                raise BadInput(f"experience: {name} is of {getattr(self, name).dtype}, not bool")
+        if np.abs(self.a).max(initial=0.0) > 1 + 1e-6:
+            raise BadInput("experience: a lies outside [−1, 1]")
         if any(x.shape[:2] != lanes for x in jax.tree.leaves(self.physics)):
             raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
 

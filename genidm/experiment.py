@@ -114,9 +114,15 @@ def main(robot: Callable[[], Robot], method: Direct | Inverse) -> None:
 
 
 def guarded(command: Callable[..., None], description: str) -> None:
-    """Runs a command line; bad input ends in one sentence on stderr and exit status 2."""
+    """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr.
+
+    The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
+    """
     try:
         tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,))
     except BadInput as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped: the same command goes on where it was", file=sys.stderr)
+        sys.exit(130)

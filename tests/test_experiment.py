@@ -347,8 +347,9 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
     assert one == again and one["journeys"] == 2 and len(one["reached"]) == 5
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
     assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
-    with pytest.raises(BadInput, match="a run"):
-        waypoints.main((), out=tmp_path)
+    for wrong, why in (((), "of a run"), (runs, "robots must")):
+        with pytest.raises(BadInput, match=why):
+            waypoints.main(wrong, robots=0, out=tmp_path)
 
 
 def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:

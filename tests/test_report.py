@@ -339,6 +339,15 @@ def test_learning_curves(tmp_path):
     drawn(report.learning_curves({"RL": curve}, path, keys=["loss"]), path)
 
 
+def test_a_long_curve_is_drawn_as_means(tmp_path):
+    noise = np.random.default_rng(0).normal(size=10_000)
+    curve = [{"step": s, "reward": 1.0 + x} for s, x in enumerate(noise)]
+    (ax,) = report.learning_curves({"SAC": curve}, tmp_path / "curves.png").axes
+    x, y = ax.lines[0].get_data()
+    np.testing.assert_allclose(y, 1.0 + noise.reshape(100, 100).mean(1))
+    np.testing.assert_allclose(x, np.arange(10_000).reshape(100, 100).mean(1))
+
+
 def test_runs_of_one_agent_are_drawn_alike(tmp_path):
     curve = [{"step": s, "reward": 0.01 * s} for s in range(0, 100, 10)]
     curves = {"PPO, seed 0": curve, "PPO, seed 1": curve[1:], "SAC, seed 0": curve}

@@ -25,6 +25,7 @@ TARGET_RADIUS = 0.1  # metres; what counts as reached, drawn to scale
 ABREAST = 5  # methods side by side in a figure of ways
 BESIDE = 0.2  # of the distance between violins; how far from the middle the means stand
 TARGET_RED = "#D00000"
+CURVE_POINTS = 100  # of a learning curve; what lies between is noise of single iterations
 FLOOR = 1e-8  # metres; where a log axis shows a residual of exactly 0
 LINEAR = 1e-2  # changes of the action below this are on the linear part of their axis
 NOISE = 1e-3  # and below this, float noise
@@ -104,7 +105,7 @@ def learning_curves(
     keys: Sequence[str] | None = None,
     steps: str = "steps",
 ) -> Figure:
-    """Metrics while learning, one panel a metric, one line a label.
+    """Metrics while learning, one panel a metric, one line a label, smoothed where it is long.
 
     Args:
       curves: label → records with "step" and metrics, as a run's JSONL holds them; a record
@@ -371,11 +372,18 @@ def _curve_panel(
     for name, records in curves.items():
         points = np.array([(r["step"], r[key]) for r in records if key in r], float)
         if points.size:
+            points = _thinned(points)
             drawing.line(ax, points[:, 0], points[:, 1], looks[_family(name)])
             least = min(least, np.min(points[:, 1]))
     if key.startswith("loss") and 0 < least < np.inf:
         ax.set_yscale("log")
     ax.xaxis.set_major_formatter(EngFormatter())
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """Points `[N, 2]`, where there are many, as means over `CURVE_POINTS` equal runs of them."""
+    runs = np.array_split(points, min(CURVE_POINTS, len(points)))
+    return np.array([run.mean(0) for run in runs])
 
 
 def _residual(ax: Axes, curve: Mapping[str, Array], style: Style) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -126,6 +127,7 @@ def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
         kept = seeds.get(test.summary["seed"])
         # A test on another part of the bank does not stand in for one on the bank.
         if not kept or kept.summary["scenarios"] != digest or test.summary["scenarios"] == digest:
+            _warn_of_another(kept, test)
             seeds[test.summary["seed"]] = test
     rows = {}
     for name in sorted(newest, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n)):
@@ -136,3 +138,15 @@ def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
         if order[0].summary["scenarios"] == digest:
             rows[name] = order
     return rows
+
+
+def _warn_of_another(kept: Tested | None, test: Tested) -> None:
+    """Says so where a row is replaced by one of the same name that was made otherwise."""
+    if kept and kept.summary["settings"] != test.summary["settings"]:
+        name = test.summary["method"]
+        print(
+            f"warning: the row {name} is of {test.summary['fit']} and no longer of "
+            f"{kept.summary['fit']}, made with other settings; "
+            "--method.name gives each a row of its own",
+            file=sys.stderr,
+        )
