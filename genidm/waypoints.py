@@ -121,12 +121,8 @@ class Journeys:
     def _corners(self) -> np.ndarray:
         """The start and the waypoints `[B, W + 1, 2]`."""
         starts = self.position[:, :1, :2]
-        points = np.broadcast_to(self.waypoints[None, :, :2], (len(starts), *self._shape))
+        points = np.tile(self.waypoints[:, :2], (len(starts), 1, 1))
         return np.concatenate([starts, points], axis=1)
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return len(self.waypoints), 2
 
     def _leg(self, end: int) -> np.ndarray:
         """Index `[B, T + 1, 1]` of a leg's beginning (0) or end (1) among the corners."""
