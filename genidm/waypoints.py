@@ -18,7 +18,7 @@ from genidm.errors import BadInput
 from genidm.evaluate import Steering
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
-from genidm.symmetry import horizontal
+from genidm.symmetry import horizontal, wrap
 
 # (o [B, 3], waypoints [W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
 # metres, world frame; asked anew at each step.
@@ -101,18 +101,18 @@ class Journeys:
         """Radians `[B, T]` between the heading and the motion; NaN where there is none."""
         motion = np.diff(self.position[..., :2], axis=1)
         course = np.arctan2(motion[..., 1], motion[..., 0])
-        angle = np.abs((self.heading[:, :-1] - course + np.pi) % (2 * np.pi) - np.pi)
+        angle = np.abs(wrap(jnp.asarray(self.heading[:, :-1] - course)))
         moves = self.made[:, 1:] & (np.linalg.norm(motion, axis=-1) > 1e-3)
         return np.where(moves, angle, np.nan)
 
     def summary(self) -> dict[str, Any]:
         """Means over the journeys: metres, seconds, radians, shares of the journeys."""
-        reached = self.arrival >= 0
+        reached, askew = self.arrival >= 0, self.askew
         times = [t[np.isfinite(t)] for t in self.times.T]
         return {
             "journeys": len(self.steps),
             "deviation": float(np.nanmean(self.deviation)),
-            "askew": float(np.nanmean(self.askew)) if np.isfinite(self.askew).any() else None,
+            "askew": float(np.nanmean(askew)) if np.isfinite(askew).any() else None,
             "reached": reached.mean(0).tolist(),
             "seconds": [float(t.mean()) if len(t) else None for t in times],
             "fell": float(self.fell.mean()),
@@ -240,31 +240,22 @@ def _chunk(
     controller: Steering,
     walker: Walker,
 ) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
-    """`settings.chunk` steps; and position `[chunk, B, 3]` and heading `[chunk, B]` after each."""
+    """`settings.chunk` steps; and position `[chunk, B, 3]` and heading `[chunk, B]` after each.
+
+    Robots that have ended stay as they are.
+    """
 
     def step(walker: Walker, _: None) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
-        walker = _step(robot, planner, settings, points, controller, walker)
+        o, left = walker.robots.position, walker.arrival < 0
+        target = planner(o, points, left)
+        after = robot.step(walker.robots, controller(walker.robots.observation, target - o))
+        steps = walker.steps + 1
+        turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
+        near = horizontal(points - after.position[:, None]) <= settings.reach
+        arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
+        through = (arrival >= 0).all(-1)
+        over = after.fallen | after.diverged | through | (steps >= settings.max_steps)
+        walker = select(walker.going, Walker(after, arrival, steps, ~over), walker)
         return walker, _seen(walker)
 
     return jax.lax.scan(step, walker, length=settings.chunk)
-
-
-def _step(
-    robot: Robot,
-    planner: Planner,
-    settings: Follow,
-    points: jax.Array,
-    controller: Steering,
-    walker: Walker,
-) -> Walker:
-    """One step of the robots that still go; the others stay as they are."""
-    o, left = walker.robots.position, walker.arrival < 0
-    target = planner(o, points, left)
-    after = robot.step(walker.robots, controller(walker.robots.observation, target - o))
-    steps = walker.steps + 1
-    turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
-    near = horizontal(points - after.position[:, None]) <= settings.reach
-    arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
-    over = after.fallen | after.diverged | (arrival >= 0).all(-1) | (steps >= settings.max_steps)
-    new = Walker(after, arrival, steps, ~over)
-    return select(walker.going, new, walker)

@@ -88,13 +88,18 @@ def _programs(bench: Bench, method: Method) -> tuple[Any, Alternating, Learner]:
     """The method's agent, its two programs, and its learner at the start."""
     agent = _agent(bench, method)
     programs = agent.programs(bench.robot, method.task, bench.mesh)
-    return agent, programs, programs.place(jax.jit(programs.start)(jax.random.key(0)))
+    return agent, programs, _placed(programs)
 
 
 def _started(bench: Bench, method: Method, agent: Agent) -> tuple[Learning, Any]:
     """The agent at work on the method's task, and its learner at the start."""
     learning = agent.learning(bench.robot, method.task, bench.mesh)
-    return learning, learning.place(jax.jit(learning.start)(jax.random.key(0)))
+    return learning, _placed(learning)
+
+
+def _placed(learning: Learning | Alternating) -> Any:
+    """A learner at its start, on its devices."""
+    return learning.place(jax.jit(learning.start)(jax.random.key(0)))
 
 
 def _iterating(

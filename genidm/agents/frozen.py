@@ -19,8 +19,6 @@ from genidm.progress import compiled
 from genidm.robots.base import Robot
 from genidm.tasks import Lanes, Task, input_size
 
-Learner = PPO | SAC
-
 
 @dataclasses.dataclass(frozen=True)
 class Frozen:
@@ -34,7 +32,7 @@ class Frozen:
       share: of the interactions that it learns from.
     """
 
-    agent: Learner
+    agent: PPO | SAC
     share: float
 
     def __post_init__(self) -> None:
@@ -51,7 +49,7 @@ class Acting:
       learned: what it ended with.
     """
 
-    agent: Learner
+    agent: PPO | SAC
     learned: Policy
 
     @property
