@@ -20,15 +20,24 @@ from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
 from genidm.symmetry import horizontal, wrap
 
-# (o [B, 3], waypoints [W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
+# (o [B, 3], waypoints [B, W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
 # metres, world frame; asked anew at each step.
 Planner = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
 def straight(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
     """Straight to the first waypoint that is left; to the last one when none is."""
-    first = jnp.where(left.any(-1), jnp.argmax(left, axis=-1), waypoints.shape[0] - 1)
-    return waypoints[first]
+    first = jnp.where(left.any(-1), jnp.argmax(left, axis=-1), waypoints.shape[1] - 1)
+    return jnp.take_along_axis(waypoints, first[:, None, None], axis=1)[:, 0]
+
+
+# State [B] → a tree of arrays [B, ...]: what is kept of every state on the way.
+Watch = Callable[[State], Any]
+
+
+def nothing(_: State) -> tuple[()]:
+    """Keeps positions and headings alone."""
+    return ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,13 +64,14 @@ class Journeys:
     """B journeys through W waypoints, over T steps at most.
 
     Attributes:
-      waypoints: `[W, 3]`, metres.
+      waypoints: `[B, W, 3]`, metres.
       position: `[B, T + 1, 3]`, metres; of a journey that is over, where it ended.
       heading: `[B, T + 1]`, radians.
       steps: `[B]`, that were made.
       arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
       fell: `[B]` bool; ended by a fall, or by physics that diverged.
       control_step: seconds.
+      watched: tree of arrays `[B, T + 1, ...]`, that was asked for beside.
     """
 
     waypoints: np.ndarray
@@ -71,6 +81,7 @@ class Journeys:
     arrival: np.ndarray
     fell: np.ndarray
     control_step: float
+    watched: Any = ()
 
     @property
     def made(self) -> np.ndarray:
@@ -120,21 +131,28 @@ class Journeys:
 
     def _corners(self) -> np.ndarray:
         """The start and the waypoints `[B, W + 1, 2]`."""
-        starts = self.position[:, :1, :2]
-        points = np.tile(self.waypoints[:, :2], (len(starts), 1, 1))
-        return np.concatenate([starts, points], axis=1)
+        return np.concatenate([self.position[:, :1, :2], self.waypoints[..., :2]], axis=1)
 
     def _leg(self, end: int) -> np.ndarray:
         """Index `[B, T + 1, 1]` of a leg's beginning (0) or end (1) among the corners."""
         step = np.arange(self.position.shape[1])
         arrived = (self.arrival[:, None] >= 0) & (self.arrival[:, None] < step[:, None])
-        return np.minimum(arrived.sum(-1), len(self.waypoints) - 1)[..., None] + end
+        return np.minimum(arrived.sum(-1), self.waypoints.shape[1] - 1)[..., None] + end
 
 
 class Walker(flax.struct.PyTreeNode):
-    """Robots on their way: State `[B]`, arrivals `[B, W]`, steps `[B]`, and whether they go on."""
+    """Robots on their way: where to, when they arrived there, and whether they go on.
+
+    Attributes:
+      robots: State `[B]`.
+      waypoints: `[B, W, 3]`, metres.
+      arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
+      steps: `[B]`, made so far.
+      going: `[B]` bool.
+    """
 
     robots: State
+    waypoints: jax.Array
     arrival: jax.Array
     steps: jax.Array
     going: jax.Array
@@ -149,6 +167,7 @@ def follow(
     planner: Planner = straight,
     settings: Follow | None = None,
     *,
+    watch: Watch = nothing,
     mesh: Mesh | None = None,
     quiet: bool = False,
 ) -> Journeys:
@@ -157,11 +176,13 @@ def follow(
     Args:
       robot: what walks.
       controller: what steers it; it is given the way to where the planner says.
-      waypoints: `[W, 2]` or `[W, 3]`, metres; without a height they have a standing robot's.
+      waypoints: `[W, 2]` or `[W, 3]`, metres, or for each robot its own, `[B, W, 2]` or
+        `[B, W, 3]`; without a height they have a standing robot's.
       keys: `[B]`, of the starts.
       yaw: `[B]`, radians, that the starts are turned by.
       planner: where to go next; straight to the next waypoint, unless given.
       settings: length of a journey, reach.
+      watch: what to keep of every state beside position and heading; nothing, unless given.
       mesh: devices to share the robots among; all, unless given.
       quiet: no progress bar.
 
@@ -169,13 +190,14 @@ def follow(
       BadInput: no waypoints, or not of two or three finite numbers each.
     """
     settings, mesh = settings or Follow(), mesh or devices.mesh()
-    points = jnp.asarray(_checked(waypoints, robot.standing_height), jnp.float32)
-    walker = _start(robot, len(points), keys, yaw, mesh)
+    points = _checked(waypoints, len(yaw), robot.standing_height)
+    walker = _start(robot, points, keys, yaw, mesh)
     controller = devices.put(controller, mesh, None)
-    body = functools.partial(_chunk, robot, planner, settings, points)
+    look = functools.partial(_seen, watch)
+    body = functools.partial(_chunk, robot, planner, settings, look)
     sharded = devices.over_lanes(body, mesh, [None, 0], (0, 1))
     step = compiled("waypoints", jax.jit(sharded, donate_argnums=1), controller, walker)
-    seen = [jax.tree.map(lambda x: np.asarray(x)[None], _seen(walker))]
+    seen = [jax.tree.map(lambda x: np.asarray(x)[None], look(walker.robots))]
     with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
         for made in range(0, settings.max_steps, settings.chunk):
             walker, way = step(controller, walker)
@@ -183,69 +205,81 @@ def follow(
             bar.advance(min(settings.chunk, settings.max_steps - made))
             if not np.asarray(walker.going).any():
                 break
-    return _journeys(robot, points, walker, seen, len(yaw))
+    return _journeys(robot, walker, seen, len(yaw))
 
 
-def _start(robot: Robot, waypoints: int, keys: jax.Array, yaw: jax.Array, mesh: Mesh) -> Walker:
+def _start(
+    robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, mesh: Mesh
+) -> Walker:
     """Robots at their starts; some twice, where the devices could not share them evenly."""
     fill = np.arange(-(-len(yaw) // mesh.size) * mesh.size) % len(yaw)
     walker = Walker(
         robots=jax.jit(robot.reset)(keys[fill], jnp.asarray(yaw, jnp.float32)[fill]),
-        arrival=jnp.full((len(fill), waypoints), -1, jnp.int32),
+        waypoints=jnp.asarray(points, jnp.float32)[fill],
+        arrival=jnp.full((len(fill), points.shape[1]), -1, jnp.int32),
         steps=jnp.zeros(len(fill), jnp.int32),
         going=jnp.ones(len(fill), bool),
     )
     return devices.put(walker, mesh)
 
 
-def _seen(walker: Walker) -> tuple[jax.Array, jax.Array]:
-    return walker.robots.position, walker.robots.heading
+def _seen(watch: Watch, robots: State) -> tuple[jax.Array, jax.Array, Any]:
+    return robots.position, robots.heading, watch(robots)
 
 
-def _journeys(
-    robot: Robot, points: jax.Array, walker: Walker, seen: list[tuple[Any, Any]], count: int
-) -> Journeys:
+def _journeys(robot: Robot, walker: Walker, seen: list[Any], count: int) -> Journeys:
     """What has become of the first `count` robots, seen `[steps, B, ...]` again and again."""
-    position, heading = (np.concatenate(part).swapaxes(0, 1) for part in zip(*seen, strict=True))
     steps = np.asarray(walker.steps)[:count]
     end = steps.max() + 1  # the last chunk may go on beyond it
+
+    def join(*parts: Any) -> np.ndarray:
+        return np.concatenate(parts).swapaxes(0, 1)[:count, :end]
+
+    position, heading, watched = jax.tree.map(join, *seen)
     robots = walker.robots
     return Journeys(
-        waypoints=np.asarray(points),
-        position=position[:count, :end],
-        heading=heading[:count, :end],
+        waypoints=np.asarray(walker.waypoints)[:count],
+        position=position,
+        heading=heading,
         steps=steps,
         arrival=np.asarray(walker.arrival)[:count],
         fell=np.asarray(robots.fallen | robots.diverged)[:count],
         control_step=robot.control_step,
+        watched=watched,
     )
 
 
-def _checked(waypoints: Any, height: float) -> np.ndarray:
-    """Waypoints `[W, 3]`; raises BadInput for what is none."""
+def _checked(waypoints: Any, count: int, height: float) -> np.ndarray:
+    """Waypoints `[B, W, 3]` of so many robots; raises BadInput for what is none."""
     points = np.asarray(waypoints, float)
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
-        raise BadInput(f"waypoints are rows of two or three numbers, not of shape {points.shape}")
+    shaped = points.ndim in (2, 3) and points.shape[-1] in (2, 3) and points.shape[-2] > 0
+    if not shaped or (points.ndim == 3 and len(points) != count):
+        raise BadInput(
+            f"waypoints are rows of two or three numbers, for all robots or for each of the "
+            f"{count}, not of shape {points.shape}"
+        )
     if not np.isfinite(points).all():
         raise BadInput("waypoints must be finite numbers")
-    level = np.full((len(points), 1), height)
-    return points if points.shape[1] == 3 else np.concatenate([points, level], axis=1)
+    level = np.full((*points.shape[:-1], 3 - points.shape[-1]), height)
+    points = np.concatenate([points, level], axis=-1)
+    return np.broadcast_to(points, (count, *points.shape[-2:]))
 
 
 def _chunk(
     robot: Robot,
     planner: Planner,
     settings: Follow,
-    points: jax.Array,
+    look: Watch,
     controller: Steering,
     walker: Walker,
-) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
-    """`settings.chunk` steps; and position `[chunk, B, 3]` and heading `[chunk, B]` after each.
+) -> tuple[Walker, Any]:
+    """`settings.chunk` steps; and what is seen `[chunk, B, ...]` after each.
 
     Robots that have ended stay as they are.
     """
+    points = walker.waypoints
 
-    def step(walker: Walker, _: None) -> tuple[Walker, tuple[jax.Array, jax.Array]]:
+    def step(walker: Walker, _: None) -> tuple[Walker, Any]:
         o, left = walker.robots.position, walker.arrival < 0
         target = planner(o, points, left)
         after = robot.step(walker.robots, controller(walker.robots.observation, target - o))
@@ -255,7 +289,7 @@ def _chunk(
         arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
         through = (arrival >= 0).all(-1)
         over = after.fallen | after.diverged | through | (steps >= settings.max_steps)
-        walker = select(walker.going, Walker(after, arrival, steps, ~over), walker)
-        return walker, _seen(walker)
+        walker = select(walker.going, Walker(after, points, arrival, steps, ~over), walker)
+        return walker, look(walker.robots)
 
     return jax.lax.scan(step, walker, length=settings.chunk)

@@ -115,7 +115,7 @@ def test_any_planner_will_do() -> None:
 
 def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
     level = journey(Point(), waypoints=np.c_[WAYPOINTS, [0.5] * 3])
-    np.testing.assert_array_equal(level.waypoints[:, 2], 0.5)
+    np.testing.assert_array_equal(level.waypoints[..., 2], 0.5)
     for wrong in (np.zeros((0, 2)), np.zeros(3), [[1.0, np.nan]], np.zeros((2, 4))):
         with pytest.raises(BadInput, match="waypoints"):
             journey(Point(), waypoints=wrong)

@@ -44,7 +44,7 @@ def journeys(by_method: Mapping[str, Journeys], reach: float, path: Target) -> F
 
 def _above(ax: Axes, made: Journeys, style: Style, reach: float) -> None:
     """Ways, waypoints in their order, and the body of the first journey's robot."""
-    corners = np.concatenate([made.position[0, :1, :2], made.waypoints[:, :2]])
+    corners = np.concatenate([made.position[0, :1, :2], made.waypoints[0, :, :2]])
     ax.plot(*corners.T, color="0.6", linestyle=":", linewidth=1.2, zorder=1)
     for number, (x, y) in enumerate(corners[1:], 1):
         ax.add_patch(Circle((x, y), reach, facecolor="none", edgecolor="black", zorder=3))
