@@ -98,11 +98,16 @@ def _sync(path: Path) -> None:
 
 def save_text(path: Path | str, text: str) -> None:
     """Writes a text file."""
+    save_bytes(path, text.encode())
+
+
+def save_bytes(path: Path | str, content: bytes) -> None:
+    """Writes a file."""
     path = Path(path)
     with disk(path):
         scratch = _scratch(path, "new")
         try:
-            scratch.write_text(text, encoding="utf-8")
+            scratch.write_bytes(content)
             _sync(scratch)
             os.replace(scratch, path)
             _sync(path.parent)

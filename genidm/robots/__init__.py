@@ -1,5 +1,8 @@
 """Robots behind one contract (`genidm.robots.base.Robot`)."""
 
+import dataclasses
+from typing import Any
+
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
@@ -20,4 +23,27 @@ def by_name(name: str) -> Robot:
     return ROBOTS[name]()
 
 
-__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name"]
+def remade(settings: dict[str, Any]) -> Robot:
+    """The robot whose `settings` a run's config holds.
+
+    Raises:
+      BadInput: no robot has that name, or none can be made so.
+    """
+    usual = by_name(settings["name"])
+    given = {name: value for name, value in settings.items() if name != "name"}
+    try:
+        arguments = {name: _like(usual.settings[name], value) for name, value in given.items()}
+        return type(usual)(**arguments)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise BadInput(f"this genidm makes no {usual.name} with {given}") from error
+
+
+def _like(model: Any, value: Any) -> Any:
+    """What `config.plain` made of a setting, as it was before: a value of the model's kind."""
+    if not dataclasses.is_dataclass(model):
+        return tuple(value) if isinstance(value, list) else value
+    fields = {name: _like(getattr(model, name), x) for name, x in value.items() if name != "class"}
+    return type(model)(**fields)
+
+
+__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name", "remade"]

@@ -12,7 +12,10 @@ from typing import Any, ClassVar
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
+from genidm.errors import BadInput
 from genidm.symmetry import Layout
 
 
@@ -50,7 +53,8 @@ class Robot(abc.ABC):
       target_distance: metres, least and greatest, of the paper's test (A.1.3).
       alive_bonus: reward of a step without a fall.
       paper_interactions: steps that the paper collects (A.1.2).
-      settings: what the robot was made with, for the names of run directories.
+      settings: its name, and what it was made with, argument by argument: they name run
+        directories, and `genidm.robots.remade` makes the robot again from them.
     """
 
     name: ClassVar[str]
@@ -87,6 +91,27 @@ class Robot(abc.ABC):
     @abc.abstractmethod
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         """Control and contact costs `[B]` of the step that led to `state` under `action`."""
+
+    def drawing(self) -> mujoco.MjSpec:
+        """A MuJoCo model that shows what the robot looks like, the caller's to change.
+
+        It is posed and looked at (`genidm.video`), never stepped; a robot on another engine
+        gives one that has its shape. Floor, lights and sky are the film's.
+
+        Raises:
+          BadInput: nobody has said what the robot looks like.
+        """
+        raise BadInput(f"there is nothing to film: the {self.name} has no drawing")
+
+    def posture(self, physics: Any) -> np.ndarray:
+        """qpos `[..., nq]` in which the drawing shows `physics [...]`, metres and radians.
+
+        It is asked on the host, for recorded physics: it need not be traceable.
+
+        Raises:
+          BadInput: as for `drawing`.
+        """
+        raise BadInput(f"there is nothing to film: the {self.name} has no drawing")
 
     def turn_physics(self, physics: Any, yaw: jax.Array) -> Any:
         """Physics after the world is turned by `yaw [B]`."""

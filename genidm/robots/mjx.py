@@ -130,6 +130,7 @@ class MjxRobot(Robot):
     reset_noise: float = 0.1
 
     def __init__(self, spec: mujoco.MjSpec, frames: int):
+        self._spec = spec
         self.mj_model = spec.compile()
         self.frames = frames
         self._model = mjx.put_model(self.mj_model, impl="jax")
@@ -153,6 +154,12 @@ class MjxRobot(Robot):
         pose = (symmetry.vector("position"), symmetry.quaternion("orientation"), angles)
         motion = (symmetry.vector("velocity", "m/s"), symmetry.body_pseudovector("spin"), rates)
         return Physics(Layout(pose), Layout(motion), Layout(motion))
+
+    def drawing(self) -> mujoco.MjSpec:
+        return self._spec.copy()
+
+    def posture(self, physics: Physics) -> np.ndarray:
+        return np.asarray(physics.qpos)
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
         physics = jax.vmap(self._draw)(keys)

@@ -1,0 +1,232 @@
+"""A film: journeys of one robot, with the pose that it was in at every step."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from genidm import controller
+from genidm.errors import BadInput
+from genidm.evaluate import Steering, Test
+from genidm.files import Torn, load_json
+from genidm.robots import Robot, State, by_name, remade
+from genidm.scenarios import scenarios
+from genidm.store import Stage
+from genidm.waypoints import Follow, Journeys, follow
+
+
+@dataclasses.dataclass(frozen=True)
+class Take:
+    """One journey, up to its end: t states, the start among them.
+
+    Attributes:
+      qpos: `[t, nq]`, of the drawing.
+      position: `[t, 3]`, of the base, metres.
+      waypoints: `[W, 3]`, metres.
+      arrival: `[W]`, step at which a waypoint was reached; −1 where it was not.
+      fell: whether it ended in a fall, or in physics that diverged.
+      control_step: seconds from one state to the next.
+    """
+
+    qpos: np.ndarray
+    position: np.ndarray
+    waypoints: np.ndarray
+    arrival: np.ndarray
+    fell: bool
+    control_step: float
+
+    @property
+    def times(self) -> np.ndarray:
+        """Seconds since the start `[t]`."""
+        return self.control_step * np.arange(len(self.qpos))
+
+    @property
+    def seconds(self) -> float:
+        """How long it took."""
+        return float(self.times[-1])
+
+    @property
+    def arrivals(self) -> np.ndarray:
+        """Seconds to each waypoint `[W]`; infinite where it was not reached."""
+        return np.where(self.arrival < 0, np.inf, self.control_step * self.arrival)
+
+    def left(self, seconds: np.ndarray) -> np.ndarray:
+        """Which waypoints are left at some times `[n]`: `[n, W]` bool."""
+        return self.arrivals > seconds[:, None] + 1e-6
+
+    def goal(self, seconds: np.ndarray) -> np.ndarray:
+        """The waypoint that it is on its way to at some times `[n]`: `[n, 3]`, metres."""
+        reached = (~self.left(seconds)).sum(-1)
+        return self.waypoints[np.minimum(reached, len(self.waypoints) - 1)]
+
+    def at(self, model: mujoco.MjModel, seconds: np.ndarray) -> np.ndarray:
+        """Poses `[n, nq]` at some times `[n]`, between the steps on the straight way."""
+        before = np.clip(seconds // self.control_step, 0, len(self.qpos) - 2).astype(int)
+        share = seconds / self.control_step - before
+        way, poses = np.zeros(model.nv), self.qpos[before].astype(float)
+        for pose, after, part in zip(poses, self.qpos[before + 1], share, strict=True):
+            mujoco.mj_differentiatePos(model, way, 1.0, pose, after.astype(float))
+            mujoco.mj_integratePos(model, pose, way, part)
+        return poses
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """Takes of one robot.
+
+    Attributes:
+      title: what the film is of.
+      drawing: what the robot looks like.
+      takes: its journeys.
+      reach: metres; a waypoint is reached when the robot is this near.
+    """
+
+    title: str
+    drawing: mujoco.MjSpec
+    takes: list[Take]
+    reach: float
+
+
+def film(
+    robot: Robot,
+    steering: Steering,
+    waypoints: Any,
+    keys: jax.Array,
+    yaw: jax.Array,
+    settings: Follow | None = None,
+    title: str = "",
+    *,
+    quiet: bool = False,
+) -> Film:
+    """Leads robots through waypoints, and keeps every pose.
+
+    Args:
+      robot: what walks.
+      steering: its controller.
+      waypoints: `[W, 2]` or `[W, 3]`, metres, or for each robot its own, `[B, W, 2]`.
+      keys: `[B]`, of the starts.
+      yaw: `[B]`, radians, that the starts are turned by.
+      settings: length of a journey, reach.
+      title: what the film is of; the robot's name, unless given.
+      quiet: no progress bar.
+
+    Raises:
+      BadInput: the robot has no drawing, or the waypoints are none.
+    """
+    settings, drawing = settings or Follow(), robot.drawing()
+
+    def physics(state: State) -> Any:
+        return state.physics
+
+    made = follow(
+        robot, steering, waypoints, keys, yaw, settings=settings, watch=physics, quiet=quiet
+    )
+    takes = list(_takes(made, robot.posture(made.watched)))
+    return Film(title or robot.name, drawing, takes, settings.reach)
+
+
+def film_test(
+    robot: Robot,
+    steering: Steering,
+    episodes: int = 3,
+    seed: int = 0,
+    seconds: float = np.inf,
+    title: str = "",
+    *,
+    quiet: bool = False,
+) -> Film:
+    """The first episodes of a test seed (A.1.3), from the same starts to the same targets.
+
+    Args:
+      robot: what walks.
+      steering: its controller.
+      episodes: how many.
+      seed: of the test.
+      seconds: a longer episode ends here.
+      title: what the film is of; the robot's name, unless given.
+      quiet: no progress bar.
+
+    Raises:
+      BadInput: the robot has no drawing, or there is no such episode.
+    """
+    robot.drawing()  # before anything is computed
+    bank, test = scenarios(robot, 1, episodes, first_seed=seed), Test()
+    settings = Follow(steps(robot, seconds, test.max_steps), test.reach)
+    keys, yaw, target = bank.keys[0], bank.yaw[0], bank.target[0]
+    return film(robot, steering, target[:, None], keys, yaw, settings, title, quiet=quiet)
+
+
+def film_run(
+    run: Path,
+    episodes: int | None = None,
+    waypoints: Any = None,
+    seed: int = 0,
+    seconds: float = np.inf,
+) -> Film:
+    """Films the controller that lies in a run's directory (METHOD-SEED-…).
+
+    Args:
+      run: the directory of a fit or a baseline, as cells leave it under --out.
+      episodes: how many episodes of the test, or journeys; 3 and 1, unless given.
+      waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test.
+      seed: of the test, or of the starts.
+      seconds: a longer journey ends here.
+
+    Raises:
+      BadInput: no controller lies there, its robot has no drawing, or a number cannot be.
+    """
+    summary = Stage(run).summary()
+    robot = robot_of(run)
+    steering, title = controller.load(run, robot), f"{summary['method']}, {robot.name}"
+    if waypoints is None:
+        return film_test(robot, steering, episodes or 3, seed, seconds, title)
+    keys = jax.random.split(jax.random.key(seed), episodes or 1)
+    settings = Follow(steps(robot, seconds, Follow().max_steps))
+    return film(robot, steering, waypoints, keys, jnp.zeros(len(keys)), settings, title)
+
+
+def steps(robot: Robot, seconds: float, most: int) -> int:
+    """Control steps in so many seconds, at most `most`.
+
+    Raises:
+      BadInput: not a step fits into them.
+    """
+    if not seconds >= robot.control_step:
+        raise BadInput(f"a film of the {robot.name} takes at least {robot.control_step} s")
+    return int(min(seconds / robot.control_step, most))
+
+
+def robot_of(run: Path) -> Robot:
+    """The robot that a run's controller was made for, with the settings it had.
+
+    A fit's config leaves them to the experience beside it; where that is gone, the robot is
+    taken as it comes.
+    """
+    experience = Stage(run).summary().get("experience")
+    for stage in (run, run.parent / experience) if experience else (run,):
+        try:
+            settings = load_json(stage / "config.json")["config"].get("robot")
+        except Torn:
+            continue
+        if settings:
+            return remade(settings)
+    return by_name(Stage(run).summary()["robot"])
+
+
+def _takes(made: Journeys, qpos: np.ndarray) -> Iterator[Take]:
+    for i, count in enumerate(made.steps + 1):
+        yield Take(
+            qpos=qpos[i, :count],
+            position=made.position[i, :count],
+            waypoints=made.waypoints[i],
+            arrival=made.arrival[i],
+            fell=bool(made.fell[i]),
+            control_step=made.control_step,
+        )

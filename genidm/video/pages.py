@@ -1,0 +1,134 @@
+"""A film as one page: what the robot is made of, its poses as numbers, and a viewer.
+
+The page is whole: it asks nothing of a network, of a GPU, or of the machine that made it.
+"""
+
+from __future__ import annotations
+
+import html
+import importlib.resources
+import json
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from genidm.video.filming import Film, Take
+from genidm.video.scenery import size
+
+FPS = 20.0
+# What is shown in whole numbers: metres in thousandths, quaternions in ten thousandths.
+PLACE, TURN = 1e3, 1e4
+HEIGHT = 460  # pixels, in a notebook
+# MuJoCo shows the groups below this one, and keeps collision shapes in those above.
+HIDDEN = 3
+
+_KINDS = mujoco.mjtGeom
+KINDS = {
+    _KINDS.mjGEOM_SPHERE: "sphere",
+    _KINDS.mjGEOM_CAPSULE: "capsule",
+    _KINDS.mjGEOM_BOX: "box",
+    _KINDS.mjGEOM_CYLINDER: "cylinder",
+    _KINDS.mjGEOM_ELLIPSOID: "ellipsoid",
+}
+
+
+class Page(str):
+    """A page of HTML, which a notebook shows in a frame of its own."""
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self)}" sandbox="allow-scripts" title="a film" '
+            f'style="width: 100%; height: {HEIGHT}px; border: 0; border-radius: 8px"></iframe>'
+        )
+
+
+def page(film: Film) -> Page:
+    """The film as a page that can be turned, zoomed and played."""
+    viewer = importlib.resources.files("genidm.video").joinpath("viewer.html").read_text("utf-8")
+    data = json.dumps(contents(film), separators=(",", ":"), allow_nan=False)
+    # A script ends at the first "</script", wherever that stands.
+    return Page(viewer.replace("FILM", data.replace("<", "\\u003c"), 1))
+
+
+def contents(film: Film) -> dict[str, Any]:
+    """What the page is given.
+
+    `fps` frames a second, `size` of the robot (m), `reach` (m), the `geoms` that the robot is
+    made of, each in the frame of a body, and the `takes`. A take's `frames` are rows of whole
+    numbers: the base's x, y, z (mm), then for each body x, y, z (mm) and quaternion (1e-4).
+    """
+    model = film.drawing.compile()
+    data = mujoco.MjData(model)
+    shown = [i for i in range(model.ngeom) if _visible(model, i)]
+    bodies = sorted({int(model.geom_bodyid[i]) for i in shown})
+    data.qpos = film.takes[0].qpos[0]
+    mujoco.mj_forward(model, data)
+    return {
+        "title": film.title,
+        "fps": FPS,
+        "reach": film.reach,
+        "size": round(size(model, data), 3),
+        "geoms": [_geom(model, i, bodies) for i in shown],
+        "takes": [_take(model, data, bodies, take) for take in film.takes],
+    }
+
+
+def _visible(model: mujoco.MjModel, geom: int) -> bool:
+    plane = model.geom_type[geom] == _KINDS.mjGEOM_PLANE
+    return not plane and model.geom_group[geom] < HIDDEN and _rgba(model, geom)[3] > 0
+
+
+def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """A geom's colour; its material's, where it has one and no colour of its own."""
+    own, material = model.geom_rgba[geom], model.geom_matid[geom]
+    plain = np.allclose(own, [0.5, 0.5, 0.5, 1.0])
+    return model.mat_rgba[material] if material >= 0 and plain else own
+
+
+def _geom(model: mujoco.MjModel, geom: int, bodies: list[int]) -> dict[str, Any]:
+    """One geom; a mesh, or what else the viewer does not know, as the box around it."""
+    kind = KINDS.get(_KINDS(model.geom_type[geom]))
+    place, turn = model.geom_pos[geom], model.geom_quat[geom]
+    middle, half = model.geom_aabb[geom].reshape(2, 3)
+    if kind is None:
+        offset = np.zeros(3)
+        mujoco.mju_rotVecQuat(offset, middle, turn)
+        place = place + offset
+    return {
+        "kind": kind or "box",
+        "body": bodies.index(int(model.geom_bodyid[geom])),
+        "size": np.round(model.geom_size[geom] if kind else half, 4).tolist(),
+        "place": np.round(place, 4).tolist(),
+        "turn": np.round(turn, 5).tolist(),
+        "colour": np.round(255 * _rgba(model, geom)[:3]).astype(int).tolist(),
+    }
+
+
+def _take(
+    model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], take: Take
+) -> dict[str, Any]:
+    seconds = np.minimum(np.arange(np.ceil(take.seconds * FPS - 1e-6) + 1) / FPS, take.seconds)
+    base = np.stack([np.interp(seconds, take.times, axis) for axis in take.position.T], axis=-1)
+    rows = []
+    for middle, pose in zip(base, take.at(model, seconds), strict=True):
+        data.qpos = pose
+        mujoco.mj_kinematics(model, data)
+        placed = np.c_[PLACE * data.xpos[bodies], TURN * data.xquat[bodies]]
+        rows.append(np.round([*(PLACE * middle), *placed.reshape(-1)]).astype(int).tolist())
+    return {
+        "seconds": round(take.seconds, 4),
+        "outcome": outcome(take),
+        "waypoints": np.round(take.waypoints, 3).tolist(),
+        "arrivals": [round(t, 3) if np.isfinite(t) else None for t in take.arrivals.tolist()],
+        "frames": rows,
+    }
+
+
+def outcome(take: Take) -> str:
+    """What became of a journey, in a few words."""
+    reached, count = int((take.arrival >= 0).sum()), len(take.arrival)
+    if reached == count:
+        return f"there in {take.seconds:.1f} s"
+    way = f"{reached} of {count}, " if count > 1 else ""
+    return f"{way}fell after {take.seconds:.1f} s" if take.fell else f"{way}{take.seconds:.1f} s"
