@@ -13,7 +13,7 @@ from genidm.cells import InverseCell
 from genidm.config import environment, plain
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.experiment import Options, bank_of, cell, guarded
+from genidm.experiment import Options, bank_of, cell, film_cell, guarded
 from genidm.methods import LR, Inverse
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
@@ -77,7 +77,7 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
     of = cells(robot, method, options)
     first = next(iter(of.values()))[0]
     bank = bank_of(first, options)
-    tests = {k: [tested(this, bank) for this in these] for k, these in of.items()}
+    tests = {k: [tested(this, bank, options.video) for this in these] for k, these in of.items()}
     written = document(first, method, bank, tests)
     here = first.root / f"{KIND}-{first.scale.name}"
     for directory in (here, options.results):
@@ -90,9 +90,11 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
     return here
 
 
-def tested(this: InverseCell, bank: Scenarios) -> Episodes:
-    """A fit's test, made unless it is there."""
+def tested(this: InverseCell, bank: Scenarios, video: bool) -> Episodes:
+    """A fit's test, made unless it is there, and its video, if that is asked for."""
     stage = this.episodes(bank, KIND)
+    if video:
+        film_cell(this)
     return Tested(stage.directory, stage.summary()).episodes
 
 

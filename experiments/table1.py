@@ -14,7 +14,7 @@ import tyro
 
 from genidm.cells import Cell
 from genidm.errors import BadInput
-from genidm.experiment import Options, bank_of, cell, guarded, write_report
+from genidm.experiment import Options, bank_of, cell, film_cell, guarded, write_report
 from genidm.methods import EXTRA, ORDER, Direct, Inverse, by_name
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
@@ -113,7 +113,10 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
         error = attempt(item)
         if error:
             failures.append(error)
-        ended |= error is None and item.bank is first.bank
+        rows = error is None and item.bank is first.bank
+        ended |= rows
+        if rows and options.video:
+            film_cell(item.cell)
     return write_report(first.cell, first.bank, options) if ended else None, failures
 
 

@@ -33,6 +33,7 @@ class Options:
         λ = 0.25, mean latents, constant learning rate.
       episodes: test episodes a seed; as the scale says, unless given.
       results: also write the table and the figures to this directory, under the robot's name.
+      video: also film three episodes of the test: a page and a gif, beside the controller.
       test: the test (A.1.3).
     """
 
@@ -42,11 +43,14 @@ class Options:
     literal: bool = False
     episodes: int | None = None
     results: Path | None = None
+    video: bool = False
     test: Test = dataclasses.field(default_factory=Test)
 
 
 def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     """The cell that a method and a user's options name."""
+    if options.video:
+        robot.drawing()  # what cannot be filmed is said before anything is computed
     scale = scale_of(options.scale, robot.paper_interactions)
     if method.agent == PPO():
         method = dataclasses.replace(method, agent=scale.ppo)
@@ -81,7 +85,25 @@ def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
     this = cell(robot, method, options)
     tested = bank_of(this, options)
     this.episodes(tested)
+    if options.video:
+        film_cell(this)
     return write_report(this, tested, options)
+
+
+def film_cell(this: Cell[Any]) -> None:
+    """Films a cell's controller: `video.html` and, where a picture can be drawn, `video.gif`."""
+    from genidm import video  # nor is this
+
+    made = video.film_test(
+        this.robot, this.controller(), title=f"{this.method.name}, {this.robot.name}"
+    )
+    stage = this.controller_stage
+    video.write(made, stage.path("video.html"))
+    try:
+        video.write(made, stage.path("video.gif"))
+    except BadInput as error:
+        print(f"no gif: {error}", file=sys.stderr)
+    print(f"Video in {stage.directory}", file=sys.stderr)
 
 
 def bank_of(this: Cell[Any], options: Options) -> Scenarios:

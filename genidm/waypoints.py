@@ -208,9 +208,7 @@ def follow(
     return _journeys(robot, walker, seen, len(yaw))
 
 
-def _start(
-    robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, mesh: Mesh
-) -> Walker:
+def _start(robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, mesh: Mesh) -> Walker:
     """Robots at their starts; some twice, where the devices could not share them evenly."""
     fill = np.arange(-(-len(yaw) // mesh.size) * mesh.size) % len(yaw)
     walker = Walker(

@@ -53,7 +53,11 @@ cells
 report.runs
 report.shown
 report.write
+video.filming video.scenery video.backends video.clip
+video.shooting video.pages
+video
 experiment
+video.__main__
 """
 
 RANKS = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

@@ -43,7 +43,8 @@ def _like(model: Any, value: Any) -> Any:
     if not dataclasses.is_dataclass(model):
         return tuple(value) if isinstance(value, list) else value
     fields = {name: _like(getattr(model, name), x) for name, x in value.items() if name != "class"}
-    return type(model)(**fields)
+    kind: Any = type(model)
+    return kind(**fields)
 
 
 __all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name", "remade"]

@@ -1,8 +1,8 @@
 """Films of a robot at work: gif, mp4, and a page that can be turned and played.
 
-    film = film_run(Path("runs/ant/LR-0-…"))
-    page(film)                       # in a notebook: shows itself
-    write(film, Path("ant.gif"))
+film = film_run(Path("runs/ant/LR-0-…"))
+page(film)                       # in a notebook: shows itself
+write(film, Path("ant.gif"))
 """
 
 from __future__ import annotations

@@ -40,7 +40,8 @@ def gif(pictures: Sequence[np.ndarray], fps: float) -> bytes:
 def _palette(pictures: Sequence[np.ndarray]) -> Image.Image:
     """The colours that some of the pictures are made of."""
     shown = pictures[:: -(-len(pictures) // SAMPLED)]
-    return Image.fromarray(np.concatenate(shown)).quantize(COLOURS, Image.Quantize.MEDIANCUT)
+    # Not by median cut, which leaves no colour for what is as small as a target.
+    return Image.fromarray(np.concatenate(shown)).quantize(COLOURS, Image.Quantize.FASTOCTREE)
 
 
 def mp4(pictures: Sequence[np.ndarray], fps: float) -> bytes:

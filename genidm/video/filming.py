@@ -21,6 +21,9 @@ from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.waypoints import Follow, Journeys, follow
 
+# Seconds; who has not arrived by then goes round and round.
+LONGEST = 20.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Take:
@@ -137,7 +140,7 @@ def film_test(
     steering: Steering,
     episodes: int = 3,
     seed: int = 0,
-    seconds: float = np.inf,
+    seconds: float = LONGEST,
     title: str = "",
     *,
     quiet: bool = False,
@@ -168,7 +171,8 @@ def film_run(
     episodes: int | None = None,
     waypoints: Any = None,
     seed: int = 0,
-    seconds: float = np.inf,
+    seconds: float = LONGEST,
+    reach: float = Follow.reach,
 ) -> Film:
     """Films the controller that lies in a run's directory (METHOD-SEED-…).
 
@@ -178,17 +182,20 @@ def film_run(
       waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test.
       seed: of the test, or of the starts.
       seconds: a longer journey ends here.
+      reach: metres; a given waypoint is reached when it is this near (the test has its own).
 
     Raises:
       BadInput: no controller lies there, its robot has no drawing, or a number cannot be.
     """
-    summary = Stage(run).summary()
-    robot = robot_of(run)
+    summary, robot = Stage(run).summary(), robot_of(run)
     steering, title = controller.load(run, robot), f"{summary['method']}, {robot.name}"
+    count = (3 if waypoints is None else 1) if episodes is None else episodes
     if waypoints is None:
-        return film_test(robot, steering, episodes or 3, seed, seconds, title)
-    keys = jax.random.split(jax.random.key(seed), episodes or 1)
-    settings = Follow(steps(robot, seconds, Follow().max_steps))
+        return film_test(robot, steering, count, seed, seconds, title)
+    if count < 1:
+        raise BadInput("a film needs at least one journey")
+    keys = jax.random.split(jax.random.key(seed), count)
+    settings = Follow(steps(robot, seconds, Follow.max_steps), reach)
     return film(robot, steering, waypoints, keys, jnp.zeros(len(keys)), settings, title)
 
 

@@ -22,7 +22,8 @@ def scene(drawing: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
 
     Args:
       drawing: of the robot; its own floor and lights are left out.
-      width, height: pixels of the greatest picture.
+      width: pixels of the greatest picture.
+      height: pixels.
     """
     spec = drawing.copy()
     planes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import mujoco
@@ -142,10 +143,10 @@ class Marks:
         for point, left in zip(self.waypoints, self.left, strict=True):
             colour = TO_GO if left else REACHED
             add(scene, kinds.mjGEOM_SPHERE, (BALL,) * 3, point, colour)
-            disc, floor = (self.reach, 0.004, 0.0), (*point[:2], 0.004)
+            disc, floor = (self.reach, 0.004, 0.0), point * [1.0, 1.0, 0.0]
             add(scene, kinds.mjGEOM_CYLINDER, disc, floor, colour)
         floored = np.c_[self.way[:, :2], np.full(len(self.way), LINE)]
-        for a, b in zip(floored, floored[1:], strict=False):
+        for a, b in itertools.pairwise(floored):
             line = add(scene, kinds.mjGEOM_CAPSULE, (LINE,) * 3, a, TRAIL)
             mujoco.mjv_connector(line, kinds.mjGEOM_CAPSULE, LINE, a, b)
 

@@ -1,0 +1,58 @@
+"""Films a saved controller: `python -m genidm.video runs/ant/LR-0-…`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from genidm import video
+from genidm.experiment import guarded
+from genidm.video.filming import LONGEST
+from genidm.waypoints import Follow
+
+
+def main(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: tuple[Path, ...] = (),
+    episodes: int | None = None,
+    waypoints: tuple[tuple[float, float], ...] = (),
+    reach: float = Follow.reach,
+    seed: int = 0,
+    seconds: float = LONGEST,
+    width: int | None = None,
+    height: int | None = None,
+    fps: float | None = None,
+) -> None:
+    """Films a controller in episodes of the test (A.1.3), or on its way through waypoints.
+
+    Args:
+      run: directory of a fit or a baseline (METHOD-SEED-…), as a cell leaves it under --out.
+      out: files to write: .gif, .mp4 (needs the extra `video`), or .html, a page that can be
+        turned and played and needs no renderer; runs/video/ROBOT-RUN.gif, unless given.
+      episodes: of the test, 3 unless given; or journeys through the waypoints, 1 unless given.
+      waypoints: x and y of each, metres; starts are near the origin. None: the test's targets.
+      reach: metres; a waypoint is reached when the robot is this near. The test has its own.
+      seed: of the test, or of the starts.
+      seconds: an episode that is longer ends here.
+      width: pixels of a picture; 320 in a gif, 640 in an mp4, unless given.
+      height: pixels; 240 and 480, unless given.
+      fps: pictures a second; 12.5 and 25, unless given.
+
+    Raises:
+      BadInput: there is no such file, controller or drawing, or nothing to draw with.
+    """
+    paths = out or (Path("runs/video") / f"{run.resolve().parent.name}-{run.resolve().name}.gif",)
+    for path in paths:
+        video.check(path)
+    given = {"width": width, "height": height, "fps": fps}
+    changes: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
+    made = video.film_run(run, episodes, waypoints or None, seed, seconds, reach)
+    for path in paths:
+        video.write(made, path, **changes)
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    guarded(main, "Films a saved controller.")

@@ -1,0 +1,394 @@
+"""Films, beside what MuJoCo itself says of the same poses, on a point whose way is known."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import io
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+from point import Physics, Point, Straight
+from tiny import TEST, tiny
+
+from genidm import methods, video
+from genidm.config import plain
+from genidm.errors import BadInput
+from genidm.experiment import Options, guarded, run_cell
+from genidm.files import save_json
+from genidm.robots import Ant, Humanoid, Logged, remade
+from genidm.robots.mjx import Solver
+from genidm.scenarios import scenarios
+from genidm.store import Stage
+from genidm.video import Film, Shot, Take, backends, clip, shooting
+from genidm.video.__main__ import main
+from genidm.video.filming import robot_of
+from genidm.video.pages import FPS, contents
+from genidm.video.scenery import REACHED, TO_GO
+from genidm.waypoints import Follow
+
+
+class Drawn(Point):
+    """The point, as a box with an arm on a hinge that stays where it is."""
+
+    def drawing(self) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec()
+        base = spec.worldbody.add_body(name="base")
+        base.add_freejoint()
+        base.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.3, 0.2, 0.1))
+        arm = base.add_body(name="arm", pos=(0.3, 0.0, 0.1))
+        arm.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 1, 0))
+        arm.add_geom(fromto=(0, 0, 0, 0.2, 0, 0.2), size=(0.05, 0, 0),
+                     type=mujoco.mjtGeom.mjGEOM_CAPSULE)  # fmt: skip
+        return spec
+
+    def posture(self, physics: Physics) -> np.ndarray:
+        hinge = np.zeros((*np.shape(physics.position)[:-1], 1))
+        return np.concatenate([physics.position, physics.orientation, hinge], axis=-1)
+
+
+def straight(robot: Point) -> Straight:
+    return Straight(jnp.float32(1.0), robot)
+
+
+@pytest.fixture(scope="module")
+def made() -> Film:
+    return video.film_test(Drawn(), straight(Drawn()), 2, title="a point", quiet=True)
+
+
+@pytest.fixture
+def renderer() -> None:
+    try:
+        backends.backend()
+    except BadInput as error:
+        pytest.skip(str(error))
+
+
+# ── what is filmed ──────────────────────────────────────────────────────────────────────
+
+
+def test_the_film_is_of_episodes_of_the_test_and_stops_at_their_end(made: Film) -> None:
+    bank = scenarios(Drawn(), 1, 2)
+    starts = Drawn().reset(bank.keys[0], bank.yaw[0]).position
+    for i, take in enumerate(made.takes):
+        np.testing.assert_allclose(take.position[0], starts[i], atol=1e-6)
+        np.testing.assert_allclose(take.waypoints, bank.target[0, i][None], atol=1e-6)
+        apart = np.linalg.norm((take.position - take.waypoints)[:, :2], axis=-1)
+        # The point goes straight there, 0.05 m a step; so near, the episode is over.
+        assert (
+            apart[-1] <= 0.1 < apart[-2] and len(take.qpos) == np.ceil((apart[0] - 0.1) / 0.05) + 1
+        )
+        assert take.arrival.tolist() == [len(take.qpos) - 1] and not take.fell
+        np.testing.assert_array_equal(take.qpos[:, :3], take.position)
+    assert len(made.takes[0].qpos) != len(made.takes[1].qpos)
+
+
+def test_waypoints_are_each_to_go_until_they_are_reached() -> None:
+    points = [(1.0, 0.0), (1.0, 1.0)]
+    keys, still = jax.random.split(jax.random.key(0), 1), jnp.zeros(1)
+    film = video.film(Drawn(), straight(Drawn()), points, keys, still, Follow(200), quiet=True)
+    (take,) = film.takes
+    first, last = take.arrivals
+    assert 0 < first < last == take.seconds and film.title == "point"
+    at = np.array([0.0, first - 0.01, first, last])
+    assert take.left(at).tolist() == [[True, True], [True, True], [False, True], [False, False]]
+    np.testing.assert_allclose(take.goal(at)[:, :2], [points[0]] * 2 + [points[1]] * 2)
+
+
+def test_seconds_end_a_film(made: Film) -> None:
+    short = video.film_test(Drawn(), straight(Drawn()), 1, seconds=0.5, quiet=True)
+    assert short.takes[0].seconds == pytest.approx(0.5) and short.takes[0].arrival.tolist() == [-1]
+    np.testing.assert_allclose(short.takes[0].qpos, made.takes[0].qpos[:11], atol=1e-6)
+
+
+def test_poses_between_steps_lie_on_the_way(made: Film) -> None:
+    model, take = made.drawing.compile(), made.takes[0]
+    np.testing.assert_allclose(take.at(model, take.times), take.qpos, atol=1e-6)
+    half = take.at(model, take.times[:-1] + take.control_step / 2)
+    np.testing.assert_allclose(half[:, :3], (take.qpos[1:] + take.qpos[:-1])[:, :3] / 2, atol=1e-6)
+    middle = (take.qpos[1:] + take.qpos[:-1])[:, 3:7]
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    np.testing.assert_allclose(half[:, 3:7], middle, atol=1e-6)
+
+
+@pytest.mark.parametrize("robot", [Point(), type("Mine", (Logged,), {"name": "mine"})()])
+def test_a_robot_without_a_drawing_is_refused(robot) -> None:
+    with pytest.raises(BadInput, match="has no drawing"):
+        video.film_test(robot, straight(Point()))
+    with pytest.raises(BadInput, match="has no drawing"):
+        robot.posture(None)
+
+
+def test_numbers_that_cannot_be_are_refused() -> None:
+    for wrong, said in (({"episodes": 0}, "at least one"), ({"seconds": 0.01}, "at least 0.05 s"),
+                        ({"seconds": np.nan}, "at least 0.05 s")):  # fmt: skip
+        with pytest.raises(BadInput, match=said):
+            video.film_test(Drawn(), straight(Drawn()), **wrong)
+    for wrong in ({"fps": 0.0}, {"width": 2}, {"hold": -1.0}):
+        with pytest.raises(BadInput, match="a shot needs"):
+            Shot(**wrong)
+
+
+# ── a run's robot ───────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    "robot", [Ant(Solver(iterations=6)), Humanoid(Solver(elliptic=False), velocity="world")]
+)
+def test_a_robot_is_made_again_from_its_settings(robot, tmp_path: Path) -> None:
+    save_json(tmp_path / "experience-0" / "config.json", {"config": {"robot": robot.settings}})
+    save_json(tmp_path / "LR-0" / "config.json", {"config": {"source": "experience-0"}})
+    Stage(tmp_path / "LR-0").finish({"robot": robot.name, "experience": "experience-0"})
+    again = robot_of(tmp_path / "LR-0")
+    assert again.settings == robot.settings and type(again) is type(robot)
+    assert again.mj_model.opt.iterations == robot.mj_model.opt.iterations
+
+
+def test_settings_of_no_robot_are_refused() -> None:
+    settings = json.loads(json.dumps(plain(Ant().settings)))
+    for wrong in ({"legs": 6}, {"solver": {**settings["solver"], "bends": 1}}):
+        with pytest.raises(BadInput, match="makes no ant"):
+            remade(settings | wrong)
+
+
+def test_without_its_experience_a_run_has_the_usual_robot(tmp_path: Path) -> None:
+    Stage(tmp_path).finish({"robot": "ant", "experience": "experience-gone"})
+    assert robot_of(tmp_path).settings == Ant().settings
+
+
+# ── the page ────────────────────────────────────────────────────────────────────────────
+
+
+def ant_film(count: int = 12) -> Film:
+    """An Ant thrown about: poses that nobody chose."""
+    robot, rng = Ant(), np.random.default_rng(0)
+    model, qpos = robot.mj_model, np.tile(robot.rest_pose(), (count, 1)).astype(float)
+    for pose in qpos:
+        mujoco.mj_integratePos(model, pose, rng.normal(size=model.nv), 0.5)
+    take = Take(qpos, qpos[:, :3], np.array([[2.0, 1.0, 0.55]]), np.array([-1]), False, 1 / FPS)
+    return Film("ant", robot.drawing(), [take], 0.1)
+
+
+def poses(page: dict, take: int = 0) -> np.ndarray:
+    """The bodies' places (m) and quaternions `[frames, bodies, 7]`."""
+    rows = np.array(page["takes"][take]["frames"], float)[:, 3:]
+    return rows.reshape(len(rows), -1, 7) / [1e3, 1e3, 1e3, 1e4, 1e4, 1e4, 1e4]
+
+
+def test_every_geom_is_where_mujoco_has_it() -> None:
+    film = ant_film()
+    page, model = contents(film), film.drawing.compile()
+    there = [i for i in range(model.ngeom) if model.geom_type[i] != mujoco.mjtGeom.mjGEOM_PLANE]
+    assert len(page["geoms"]) == len(there) == model.ngeom - 1
+    data, point = mujoco.MjData(model), np.zeros(3)
+    for pose, bodies in zip(film.takes[0].qpos, poses(page), strict=True):
+        data.qpos = pose
+        mujoco.mj_forward(model, data)
+        for geom, i in zip(page["geoms"], there, strict=True):
+            body = bodies[geom["body"]]
+            np.testing.assert_allclose(body[:3], data.xpos[model.geom_bodyid[i]], atol=6e-4)
+            mujoco.mju_rotVecQuat(point, np.array(geom["place"]), body[3:])
+            np.testing.assert_allclose(body[:3] + point, data.geom_xpos[i], atol=1e-3)
+
+
+def test_every_kind_of_geom_is_shown_and_a_mesh_as_its_box() -> None:
+    spec = Drawn().drawing()
+    arm = spec.body("arm")
+    corners = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.5]], float)
+    spec.add_mesh(
+        name="wedge", uservert=corners.reshape(-1), userface=[0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
+    )
+    kinds = mujoco.mjtGeom
+    for kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_ELLIPSOID):
+        arm.add_geom(type=kind, size=(0.1, 0.2, 0.3), rgba=(1, 0, 0, 1))
+    arm.add_geom(type=kinds.mjGEOM_MESH, meshname="wedge", pos=(0.1, 0.2, 0.3))
+    arm.add_geom(type=kinds.mjGEOM_BOX, size=(1, 1, 1), group=3)
+    arm.add_geom(type=kinds.mjGEOM_BOX, size=(1, 1, 1), rgba=(1, 0, 0, 0))
+    qpos = np.array([[0.0, 0, 0, 1, 0, 0, 0, 0]] * 2)
+    take = Take(qpos, qpos[:, :3], np.zeros((1, 3)), np.array([1]), False, 0.1)
+    page = contents(Film("all", spec, [take], 0.1))
+    shown = [geom["kind"] for geom in page["geoms"]]
+    assert shown == ["box", "capsule", "sphere", "cylinder", "ellipsoid", "box"]
+    assert page["geoms"][2]["colour"] == [255, 0, 0]
+    box = page["geoms"][-1]
+    # The body's frame is turned by nothing here, so the corners are where the file has them.
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, np.array(box["turn"]))
+    inside = (corners + [0.1, 0.2, 0.3] - box["place"]) @ turned.reshape(3, 3)
+    assert (np.abs(inside) <= np.array(box["size"]) + 1e-3).all()
+
+
+def test_a_page_says_how_the_journeys_went(made: Film) -> None:
+    page = contents(made)
+    for shown, take in zip(page["takes"], made.takes, strict=True):
+        assert shown["arrivals"] == [pytest.approx(take.seconds)]
+        assert shown["outcome"] == f"there in {take.seconds:.1f} s"
+        np.testing.assert_allclose(
+            np.array(shown["frames"])[-1, :3] / 1e3, take.position[-1], atol=6e-4
+        )
+        assert len(shown["frames"]) == len(take.qpos)  # both are of 0.05 s
+    lost = dataclasses.replace(made.takes[0], arrival=np.array([5, -1]), fell=True)
+    assert video.pages.outcome(lost) == f"1 of 2, fell after {lost.seconds:.1f} s"
+
+
+def test_a_page_is_whole_and_nothing_breaks_out_of_it(made: Film) -> None:
+    film = dataclasses.replace(made, title='</script><b>"&')
+    page = video.page(film)
+    assert (
+        "http" not in page and "src=" not in page and "<link" not in page and "@import" not in page
+    )
+    start = page.index('id="film">') + len('id="film">')
+    data = json.loads(page[start : page.index("</script>", start)])
+    assert data["title"] == film.title and len(data["takes"]) == 2
+    shown = page._repr_html_()
+    srcdoc = shown.split('srcdoc="')[1].split('" sandbox')[0]
+    assert html.unescape(srcdoc) == page
+
+
+# ── pictures ────────────────────────────────────────────────────────────────────────────
+
+
+def near(picture: np.ndarray, colour: tuple[float, ...]) -> int:
+    """How many pixels have the hue of a colour: more of its strongest part than floor and box."""
+    wanted = np.array(colour[:3]) - np.mean(colour[:3])
+    shade = picture.astype(float) - picture.mean(-1, keepdims=True)
+    along = shade @ wanted / np.linalg.norm(wanted)
+    across = np.linalg.norm(shade - along[..., None] * wanted / np.linalg.norm(wanted), axis=-1)
+    return int(((along > 40) & (across < 0.5 * along)).sum())
+
+
+@pytest.mark.usefixtures("renderer")
+def test_pictures_show_the_target_and_that_it_was_reached(made: Film) -> None:
+    film = dataclasses.replace(made, takes=made.takes[:1])
+    shot = Shot(160, 120, 5.0, hold=0.4, caption=False)
+    pictures = np.stack(list(video.frames(film, shot, quiet=True)))
+    seconds = film.takes[0].seconds
+    assert pictures.shape == (np.ceil(seconds * 5) + 3, 120, 160, 3)
+    assert near(pictures[0], TO_GO) > 10 and near(pictures[0], REACHED) == 0
+    assert near(pictures[-1], REACHED) > 10 and near(pictures[-1], TO_GO) == 0
+    moved = np.abs(np.diff(pictures[:-2].astype(int), axis=0)).max((1, 2, 3))
+    assert (moved > 30).all()
+    np.testing.assert_array_equal(pictures[-1], pictures[-3])  # the end, held
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_gif_has_every_picture_for_its_time(made: Film, tmp_path: Path) -> None:
+    film = dataclasses.replace(made, takes=made.takes[:1])
+    video.write(film, tmp_path / "a.gif", quiet=True, width=96, height=64, hold=0.0)
+    with Image.open(tmp_path / "a.gif") as gif:
+        shown = shooting.times(film.takes[0], Shot(hold=0.0))
+        assert gif.size == (96, 64) and gif.n_frames == len(shown) and gif.info["loop"] == 0
+        assert {frame_time(gif, i) for i in range(gif.n_frames)} == {80}
+
+
+def frame_time(gif: Image.Image, number: int) -> int:
+    gif.seek(number)
+    return gif.info["duration"]
+
+
+def test_a_gif_keeps_the_colours_of_little_things() -> None:
+    floor = np.linspace(120, 230, 96 * 64).reshape(64, 96, 1).repeat(3, -1).astype(np.uint8)
+    pictures = [floor.copy() for _ in range(10)]
+    for i, picture in enumerate(pictures):
+        picture[30:36, 8 * i : 8 * i + 6] = np.round(255 * np.array(TO_GO[:3]))
+    with Image.open(io.BytesIO(clip.gif(pictures, 12.5))) as gif:
+        gif.seek(5)
+        found = np.asarray(gif.convert("RGB"))[32, 42].astype(int)
+    assert np.abs(found - 255 * np.array(TO_GO[:3])).max() < 20
+
+
+def test_the_camera_keeps_the_robot_in_the_middle_and_its_goal_in_sight(made: Film) -> None:
+    take = made.takes[0]
+    cameras = shooting._cameras(take, take.times, 1.0)
+    ahead = np.radians([camera.azimuth for camera in cameras])
+    way = (take.waypoints - take.position)[:, :2]
+    angle = np.arctan2(way[:, 1], way[:, 0]) - ahead
+    assert (np.abs(np.degrees((angle + np.pi) % (2 * np.pi) - np.pi)) < 45).all()
+    apart = np.linalg.norm([c.lookat for c in cameras] - take.position, axis=-1)
+    assert apart.max() < 0.25
+
+
+def test_mp4_needs_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(BadInput, match=r"genidm\[video\]"):
+        clip.encoder()
+
+
+def test_an_mp4_has_every_picture(tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="mp4 needs imageio-ffmpeg")
+    (tmp_path / "a.mp4").write_bytes(clip.mp4([np.full((64, 96, 3), 25 * i) for i in range(10)], 5))
+    assert ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4")) == (
+        10,
+        pytest.approx(2.0, abs=0.1),
+    )
+
+
+# ── what it draws with ──────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which nothing starts."""
+    backends.backend.cache_clear()
+    monkeypatch.setattr(backends, "starts", lambda name: False)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_without_a_renderer_a_command_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["video", str(tmp_path), "--out", str(tmp_path / "a.gif")])
+    with pytest.raises(SystemExit) as stop:
+        guarded(main, "Films a saved controller.")
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
+    assert "libosmesa6" in said and "libegl1" in said and ".html" in said
+    assert not (tmp_path / "a.gif").exists()
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_the_user_says_what_to_draw_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(backends.candidates()) == {"egl", "osmesa"}
+    monkeypatch.setenv("MUJOCO_GL", "OSMesa")
+    assert backends.candidates() == ("osmesa",)
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(BadInput, match="MUJOCO_GL turns it off"):
+        backends.backend()
+
+
+def test_what_does_not_start_is_not_taken() -> None:
+    assert not backends.starts("nothing_of_that_name")
+
+
+def test_a_film_is_one_of_three_kinds(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"a \.gif, an \.mp4 or a page"):
+        video.check(tmp_path / "film.avi")
+
+
+# ── from a command ──────────────────────────────────────────────────────────────────────
+
+
+def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
+    tmp_path: Path, nowhere: None, capsys: pytest.CaptureFixture
+) -> None:
+    method = tiny(methods.RS)
+    options = Options(scale="0.25", out=tmp_path, episodes=2, test=TEST, video=True)
+    run_cell(Drawn(), method, options)
+    (page,) = tmp_path.glob("point/RS-0-*/video.html")
+    assert "RS, point" in page.read_text() and "no gif: no picture" in capsys.readouterr().err
+
+
+def test_a_cell_that_cannot_be_filmed_says_so_before_it_begins(tmp_path: Path) -> None:
+    options = Options(scale="0.25", out=tmp_path, episodes=2, test=TEST, video=True)
+    with pytest.raises(BadInput, match="has no drawing"):
+        run_cell(Point(), tiny(methods.RS), options)
+    assert not list(tmp_path.iterdir())
