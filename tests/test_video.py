@@ -60,7 +60,7 @@ def straight(robot: Point) -> Straight:
 
 @pytest.fixture(scope="module")
 def made() -> Film:
-    return video.film_test(Drawn(), straight(Drawn()), 2, title="a point", quiet=True)
+    return video.film_test(Drawn(), straight(Drawn()), (0, 2), title="a point", quiet=True)
 
 
 @pytest.fixture
@@ -75,9 +75,9 @@ def renderer() -> None:
 
 
 def test_the_film_is_of_episodes_of_the_test_and_stops_at_their_end(made: Film) -> None:
-    bank = scenarios(Drawn(), 1, 2)
+    bank = scenarios(Drawn(), 1, 3)
     starts = Drawn().reset(bank.keys[0], bank.yaw[0]).position
-    for i, take in enumerate(made.takes):
+    for i, take in zip((0, 2), made.takes, strict=True):
         np.testing.assert_allclose(take.position[0], starts[i], atol=1e-6)
         np.testing.assert_allclose(take.waypoints, bank.target[0, i][None], atol=1e-6)
         apart = np.linalg.norm((take.position - take.waypoints)[:, :2], axis=-1)
@@ -103,7 +103,7 @@ def test_waypoints_are_each_to_go_until_they_are_reached() -> None:
 
 
 def test_seconds_end_a_film(made: Film) -> None:
-    short = video.film_test(Drawn(), straight(Drawn()), 1, seconds=0.5, quiet=True)
+    short = video.film_test(Drawn(), straight(Drawn()), [0], seconds=0.5, quiet=True)
     assert short.takes[0].seconds == pytest.approx(0.5) and short.takes[0].arrival.tolist() == [-1]
     np.testing.assert_allclose(short.takes[0].qpos, made.takes[0].qpos[:11], atol=1e-6)
 
@@ -127,8 +127,11 @@ def test_a_robot_without_a_drawing_is_refused(robot) -> None:
 
 
 def test_numbers_that_cannot_be_are_refused() -> None:
-    for wrong, said in (({"episodes": 0}, "at least one"), ({"seconds": 0.01}, "at least 0.05 s"),
-                        ({"seconds": np.nan}, "at least 0.05 s")):  # fmt: skip
+    refused: list[tuple[dict, str]] = [
+        ({"episodes": ()}, "at least one"), ({"episodes": (1, -1)}, "0, 1, 2"),
+        ({"seconds": 0.01}, "at least 0.05 s"), ({"seconds": np.nan}, "at least 0.05 s"),
+    ]  # fmt: skip
+    for wrong, said in refused:
         with pytest.raises(BadInput, match=said):
             video.film_test(Drawn(), straight(Drawn()), **wrong)
     for wrong in ({"fps": 0.0}, {"width": 2}, {"hold": -1.0}):
@@ -221,7 +224,7 @@ def test_every_kind_of_geom_is_shown_and_a_mesh_as_its_box() -> None:
     # The body's frame is turned by nothing here, so the corners are where the file has them.
     turned = np.zeros(9)
     mujoco.mju_quat2Mat(turned, np.array(box["turn"]))
-    inside = (corners + [0.1, 0.2, 0.3] - box["place"]) @ turned.reshape(3, 3)
+    inside = (corners + np.array([0.1, 0.2, 0.3]) - box["place"]) @ turned.reshape(3, 3)
     assert (np.abs(inside) <= np.array(box["size"]) + 1e-3).all()
 
 

@@ -16,7 +16,7 @@ from genidm.waypoints import Follow
 def main(
     run: Annotated[Path, tyro.conf.Positional],
     out: tuple[Path, ...] = (),
-    episodes: int | None = None,
+    episodes: tuple[int, ...] = (),
     waypoints: tuple[tuple[float, float], ...] = (),
     reach: float = Follow.reach,
     seed: int = 0,
@@ -31,7 +31,8 @@ def main(
       run: directory of a fit or a baseline (METHOD-SEED-…), as a cell leaves it under --out.
       out: files to write: .gif, .mp4 (needs the extra `video`), or .html, a page that can be
         turned and played and needs no renderer; runs/video/ROBOT-RUN.gif, unless given.
-      episodes: of the test, 3 unless given; or journeys through the waypoints, 1 unless given.
+      episodes: numbers of the test's episodes, from 0 on, or of the starts of journeys through
+        waypoints; 0 1 2 of the test, and one journey, unless given.
       waypoints: x and y of each, metres; starts are near the origin. None: the test's targets.
       reach: metres; a waypoint is reached when the robot is this near. The test has its own.
       seed: of the test, or of the starts.
