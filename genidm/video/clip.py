@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import tempfile
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,8 @@ def mp4(pictures: Sequence[np.ndarray], fps: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         writer = encoder().write_frames(str(path), (width, height), fps=fps, macro_block_size=2)
-        writer.send(None)
+        with warnings.catch_warnings(category=RuntimeWarning, action="ignore"):
+            writer.send(None)  # jax warns of forks, but here another program follows at once
         for picture in pictures:
             writer.send(np.ascontiguousarray(picture))
         writer.close()

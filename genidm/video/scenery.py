@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 
 SUN = (-0.4, 0.3, -1.0)
-REACH_OF_SHADOWS = 4.0  # metres
+# Metres from what the camera looks at to the sun: it goes along, and the shadows with it.
+SUN_AWAY = 12.0
+REACH_OF_SHADOWS = 20.0  # metres
 RGBA = tuple[float, float, float, float]
 
 # Okabe and Ito's: vermilion, bluish green, blue.
@@ -39,7 +41,7 @@ def scene(drawing: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
     spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
     spec.visual.headlight.specular = (0, 0, 0)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    # Shadows are as sharp as this is small; films move the light along with the robot.
+    # Shadows are as sharp as this is small, but there is noise on the floor that lies farther.
     spec.stat.extent = REACH_OF_SHADOWS
     return spec.compile()
 

@@ -14,7 +14,7 @@ from genidm.errors import BadInput
 from genidm.progress import Progress
 from genidm.video import backends
 from genidm.video.filming import Film, Take
-from genidm.video.scenery import REACHED, RGBA, SUN, TO_GO, TRAIL, scene, size
+from genidm.video.scenery import REACHED, RGBA, SUN, SUN_AWAY, TO_GO, TRAIL, scene, size
 
 # The camera: metres away in sizes of the robot, degrees, seconds that its moves are smoothed over.
 AWAY = 3.7
@@ -22,8 +22,10 @@ DOWN = -27.0
 ASIDE = 38.0
 CALM_PLACE = 0.25
 CALM_TURN = 0.7
-# Metres: the ball over a waypoint, the width of the trail, from one piece of it to the next.
+# A waypoint's flag: a ball that hovers over where the base should come, in sizes of the robot.
 BALL = 0.13
+HOVER = 0.65
+# Metres: radius of the trail and of a flag's pole, from one piece of the trail to the next.
 LINE = 0.02
 PIECE = 0.08
 MOST_MARKS = 4000
@@ -108,7 +110,7 @@ class Eye:
 
     def look(self, camera: mujoco.MjvCamera, marks: Marks) -> np.ndarray:
         """The picture `[height, width, 3]` of the robot and of marks."""
-        self.data.light_xpos[:] = camera.lookat - 3.0 * np.asarray(SUN)
+        self.data.light_xpos[:] = camera.lookat - SUN_AWAY * np.asarray(SUN)
         everything, options = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvOption()
         mujoco.mjv_updateScene(
             self.model, self.data, options, None, camera, everything, self._scene
@@ -130,25 +132,28 @@ class Marks:
       left: `[W]` bool, which of them are not reached yet.
       way: `[n, 3]`, metres.
       reach: metres.
+      size: of the robot, metres.
     """
 
     waypoints: np.ndarray
     left: np.ndarray
     way: np.ndarray
     reach: float
+    size: float
 
     def __call__(self, scene: mujoco.MjvScene) -> None:
         """Adds them to a scene."""
         kinds = mujoco.mjtGeom
         for point, left in zip(self.waypoints, self.left, strict=True):
             colour = TO_GO if left else REACHED
-            add(scene, kinds.mjGEOM_SPHERE, (BALL,) * 3, point, colour)
-            disc, floor = (self.reach, 0.004, 0.0), point * [1.0, 1.0, 0.0]
-            add(scene, kinds.mjGEOM_CYLINDER, disc, floor, colour)
+            foot, top = point.copy(), point.copy()
+            foot[2], top[2] = 0.0, point[2] + HOVER * self.size
+            add(scene, kinds.mjGEOM_SPHERE, (BALL * self.size,) * 3, top, colour)
+            add(scene, kinds.mjGEOM_CYLINDER, (self.reach, 0.004, 0.0), foot, (*colour[:3], 0.4))
+            add_line(scene, foot, top, LINE / 2, colour)
         floored = np.c_[self.way[:, :2], np.full(len(self.way), LINE)]
         for a, b in itertools.pairwise(floored):
-            line = add(scene, kinds.mjGEOM_CAPSULE, (LINE,) * 3, a, TRAIL)
-            mujoco.mjv_connector(line, kinds.mjGEOM_CAPSULE, LINE, a, b)
+            add_line(scene, a, b, LINE, TRAIL)
 
 
 def add(
@@ -163,13 +168,22 @@ def add(
     return geom
 
 
+def add_line(
+    scene: mujoco.MjvScene, a: np.ndarray, b: np.ndarray, radius: float, colour: RGBA
+) -> None:
+    """A round line in a scene, from a to b `[3]`."""
+    kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+    mujoco.mjv_connector(add(scene, kind, (radius,) * 3, a, colour), kind, radius, a, b)
+
+
 def _take(eye: Eye, film: Film, take: Take, seconds: np.ndarray) -> Iterator[np.ndarray]:
     poses = take.at(eye.model, seconds)
     eye.pose(poses[0])
-    cameras = _cameras(take, seconds, size(eye.model, eye.data))
+    metres = size(eye.model, eye.data)
+    cameras = _cameras(take, seconds, metres)
     for pose, left, now, camera in zip(poses, take.left(seconds), seconds, cameras, strict=True):
         eye.pose(pose)
-        yield eye.look(camera, Marks(take.waypoints, left, _way(take, now), film.reach))
+        yield eye.look(camera, Marks(take.waypoints, left, _way(take, now), film.reach, metres))
 
 
 def _way(take: Take, now: float) -> np.ndarray:
