@@ -18,7 +18,7 @@ from PIL import Image
 from point import Physics, Point, Straight
 from tiny import TEST, tiny
 
-from genidm import methods, video
+from genidm import methods, robots, video
 from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.experiment import Options, guarded, run_cell
@@ -29,7 +29,7 @@ from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.video import Film, Shot, Take, backends, clip, shooting
 from genidm.video.__main__ import main
-from genidm.video.filming import robot_of
+from genidm.video.filming import LONGEST, robot_of
 from genidm.video.pages import FPS, contents
 from genidm.video.scenery import REACHED, TO_GO
 from genidm.waypoints import Follow
@@ -241,14 +241,19 @@ def test_a_page_says_how_the_journeys_went(made: Film) -> None:
     assert video.pages.outcome(lost) == f"1 of 2, fell after {lost.seconds:.1f} s"
 
 
+def inside(page: str) -> dict:
+    """What a page was given, as a browser finds it."""
+    start = page.index('id="film">') + len('id="film">')
+    return json.loads(page[start : page.index("</script>", start)])
+
+
 def test_a_page_is_whole_and_nothing_breaks_out_of_it(made: Film) -> None:
     film = dataclasses.replace(made, title='</script><b>"&')
     page = video.page(film)
     assert (
         "http" not in page and "src=" not in page and "<link" not in page and "@import" not in page
     )
-    start = page.index('id="film">') + len('id="film">')
-    data = json.loads(page[start : page.index("</script>", start)])
+    data = inside(page)
     assert data["title"] == film.title and len(data["takes"]) == 2
     shown = page._repr_html_()
     srcdoc = shown.split('srcdoc="')[1].split('" sandbox')[0]
@@ -326,7 +331,8 @@ def test_mp4_needs_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_mp4_has_every_picture(tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="mp4 needs imageio-ffmpeg")
-    (tmp_path / "a.mp4").write_bytes(clip.mp4([np.full((64, 96, 3), 25 * i) for i in range(10)], 5))
+    pictures = [np.full((64, 96, 3), 25 * i, np.uint8) for i in range(10)]
+    (tmp_path / "a.mp4").write_bytes(clip.mp4(pictures, 5.0))
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4")) == (
         10,
         pytest.approx(2.0, abs=0.1),
@@ -381,13 +387,20 @@ def test_a_film_is_one_of_three_kinds(tmp_path: Path) -> None:
 
 
 def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
-    tmp_path: Path, nowhere: None, capsys: pytest.CaptureFixture
+    tmp_path: Path, nowhere: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    method = tiny(methods.RS)
     options = Options(scale="0.25", out=tmp_path, episodes=2, test=TEST, video=True)
-    run_cell(Drawn(), method, options)
-    (page,) = tmp_path.glob("point/RS-0-*/video.html")
-    assert "RS, point" in page.read_text() and "no gif: no picture" in capsys.readouterr().err
+    run_cell(Drawn(), tiny(methods.RS), options)
+    (path,) = tmp_path.glob("point/RS-0-*/video.html")
+    beside = inside(path.read_text())
+    assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
+    monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
+    main(path.parent, (tmp_path / "again.html",), seconds=LONGEST)
+    assert inside((tmp_path / "again.html").read_text()) == beside  # found by its run alone
+    main(path.parent, (tmp_path / "way.html",), (4, 1), waypoints=((9.0, 0.0), (0.0, 9.0)))
+    way = inside((tmp_path / "way.html").read_text())
+    assert [take["waypoints"] for take in way["takes"]] == [[[9, 0, 0.5], [0, 9, 0.5]]] * 2
+    assert way["reach"] == Follow.reach and "way.html" in capsys.readouterr().out
 
 
 def test_a_cell_that_cannot_be_filmed_says_so_before_it_begins(tmp_path: Path) -> None:

@@ -123,6 +123,29 @@ def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
         Follow(reach=0.0)
 
 
+def test_each_robot_may_have_waypoints_of_its_own(made: Journeys) -> None:
+    shift = np.linspace(0.0, 1.0, COUNT)[:, None, None] * [1.0, -1.0]
+    own = journey(Point(), waypoints=WAYPOINTS + shift)
+    np.testing.assert_allclose(own.waypoints[..., :2], WAYPOINTS + shift, atol=1e-6)
+    np.testing.assert_array_equal(own.position[0, : own.steps[0]], made.position[0, : own.steps[0]])
+    for i in range(COUNT):
+        assert own.steps[i] == own.arrival[i, -1]
+        reached = own.position[i, own.arrival[i], :2]
+        apart = np.linalg.norm(reached - own.waypoints[i, :, :2], axis=-1)
+        assert (apart <= SETTINGS.reach + 1e-6).all() and (apart > SETTINGS.reach - 0.06).all()
+    with pytest.raises(BadInput, match="for each of the 5"):
+        journey(Point(), waypoints=np.zeros((COUNT - 1, 3, 2)))
+
+
+def test_what_is_watched_is_kept_of_every_state(made: Journeys) -> None:
+    kept = journey(
+        Point(), watch=lambda state: {"s": state.observation, "x": state.physics}
+    ).watched
+    assert kept["s"].shape[:2] == made.heading.shape and made.watched == ()
+    np.testing.assert_array_equal(kept["x"].position, made.position)
+    np.testing.assert_array_equal(kept["s"][..., 0], made.position[..., 2])
+
+
 def test_the_figure_shows_every_method(made: Journeys, tmp_path: Path) -> None:
     fig = journeys({"LR": made, "VGCP": made}, SETTINGS.reach, tmp_path / "w.png")
     assert (tmp_path / "w.png").stat().st_size > 10_000

@@ -34,12 +34,14 @@ def remade(settings: dict[str, Any]) -> Robot:
     try:
         arguments = {name: _like(usual.settings[name], value) for name, value in given.items()}
         return type(usual)(**arguments)
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise BadInput(f"this genidm makes no {usual.name} with {given}") from error
 
 
 def _like(model: Any, value: Any) -> Any:
     """What `config.plain` made of a setting, as it was before: a value of the model's kind."""
+    if isinstance(model, float):
+        return float(value)  # "inf" is a string in JSON
     if not dataclasses.is_dataclass(model):
         return tuple(value) if isinstance(value, list) else value
     fields = {name: _like(getattr(model, name), x) for name, x in value.items() if name != "class"}
