@@ -10,6 +10,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from genidm import devices
+from genidm.agents.frozen import Frozen
+from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.errors import BadInput
@@ -50,6 +53,9 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     scale = scale_of(options.scale, robot.paper_interactions)
     if method.agent == PPO():
         method = dataclasses.replace(method, agent=scale.ppo)
+    if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
+        wide: Any = method.agent.wide()  # of the method's own type
+        method = dataclasses.replace(method, agent=wide)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale, seed=options.seed, root=options.out / robot.name,
         test=options.test,
