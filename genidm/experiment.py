@@ -71,8 +71,12 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
 
 def _fitting(method: Inverse, scale: Scale) -> Inverse:
     """The method as far as a scale's record is long enough for it."""
+    agent = method.agent
+    if isinstance(agent, Frozen):
+        agent = dataclasses.replace(agent, share=max(agent.share, scale.learning))
     return dataclasses.replace(
         method,
+        agent=agent,
         look_ahead=min(method.look_ahead, scale.look_ahead),
         share=max(method.share, scale.share),
     )
