@@ -127,7 +127,7 @@ HUMANOID: Methods = (
 )
 """SAC learns for 5 M interactions, is frozen, and collects 10 M (A.1.2, Table 2)."""
 
-TABLES = {"ant": ANT, "humanoid": HUMANOID}
+TABLES = {"ant": ANT, "humanoid": HUMANOID, "humanoid_world": HUMANOID}
 """Robot → the methods of its column. A robot without one has the Ant's."""
 
 

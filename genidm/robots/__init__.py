@@ -3,10 +3,10 @@
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
-from genidm.robots.humanoid import Humanoid
+from genidm.robots.humanoid import Humanoid, HumanoidWorld
 from genidm.robots.logged import Logged
 
-ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid)}
+ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld)}
 
 
 def by_name(name: str) -> Robot:
@@ -20,4 +20,4 @@ def by_name(name: str) -> Robot:
     return ROBOTS[name]()
 
 
-__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name"]
+__all__ = ["ROBOTS", "Ant", "Humanoid", "HumanoidWorld", "Logged", "Robot", "State", "by_name"]
