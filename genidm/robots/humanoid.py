@@ -69,7 +69,7 @@ class Humanoid(MjxRobot):
     def __init__(self, solver: Solver | None = None):
         solver = solver or Solver()
         super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), frames=4)
-        self.settings = {"name": self.name, "solver": solver, "velocity": self.velocity}
+        self.settings = {"name": self.name, "solver": solver}
         limits = self.mj_model.jnt_range[1:]
         self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])
