@@ -7,6 +7,9 @@ import dataclasses
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
 
+# Interactions up to which an agent has just begun to learn.
+YOUNG = 400_000
+
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
@@ -19,7 +22,7 @@ class Scale:
       seeds: test seeds.
       episodes: test episodes a seed.
       look_ahead: most steps to the intermediate goal. Agents that have just begun to learn
-        fall so soon that few of their episodes reach further.
+        (`YOUNG`) fall so soon that few of their episodes reach further.
       share: least part of the record that is learned from: in the first half of a short one
         the agent hardly walks.
       learning: least part of the interactions in which an agent that is frozen afterwards
@@ -62,12 +65,13 @@ def scale_of(text: str, interactions: int) -> Scale:
         share = 0.0
     if not 0 < share < float("inf"):
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
+    interactions = max(1, round(interactions * share))
     return Scale(
         name=text,
-        interactions=max(1, round(interactions * share)),
+        interactions=interactions,
         updates=min(share, 1.0),
         seeds=10,
         episodes=max(10, round(1000 * min(share, 1.0))),
-        look_ahead=1000 if share > 0.2 else 50,
+        look_ahead=1000 if interactions > YOUNG else 50,
         learning=2 / 3 if share < 1 else 0.0,
     )
