@@ -19,6 +19,8 @@ from genidm.robots import Robot, by_name
 
 Frame = Literal["world", "heading"]
 
+PRETRAINED = Path(__file__).parent / "pretrained"
+
 
 def in_frame(robot: Robot, frame: Frame, s: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
     """s `[..., S]` and d `[..., 3]` as a method sees them.
@@ -98,6 +100,20 @@ class Controller(flax.struct.PyTreeNode):
             meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
         )
         return cls(**tree, architecture=architecture, frame=meta["frame"], robot=robot)
+
+
+def pretrained(robot: str) -> Controller | Policy:
+    """A controller that comes with genidm: the best that was made for a robot of this name.
+
+    Its directory, `genidm/pretrained/ROBOT`, says how: it is that of a run.
+
+    Raises:
+      BadInput: none comes for this robot.
+    """
+    if not (PRETRAINED / robot).is_dir():
+        there = ", ".join(sorted(path.name for path in PRETRAINED.iterdir()))
+        raise BadInput(f"no controller comes for {robot!r}; there are some for: {there}")
+    return load(PRETRAINED / robot)
 
 
 def load(path: Path, robot: Robot | None = None) -> Controller | Policy:

@@ -17,6 +17,10 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 LANES = "lanes"
+# Robots that keep an accelerator busy; MJX steps hardly more a second with more of them.
+BUSY = 4096
+# Bytes that a robot takes in a program, amply: for its step XLA plans 20 kB (Humanoid), 11 (Ant).
+ROBOT = 1 << 17
 
 
 def configure() -> None:
@@ -59,6 +63,28 @@ def mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
         axis_types=(jax.sharding.AxisType.Auto,),
         devices=devices,
     )
+
+
+def memory() -> int | None:
+    """Bytes that programs on an accelerator can have; None on a CPU, which shares the host's."""
+    stats = jax.devices()[0].memory_stats()
+    return stats["bytes_limit"] if stats else None
+
+
+def at_once(robots: int) -> int:
+    """Robots to step at once where no result depends on their number.
+
+    On a CPU as many as asked for; on an accelerator more, which few do not keep busy, as far
+    as a quarter of its memory holds them.
+    """
+    room = memory()
+    return robots if room is None else max(robots, min(BUSY, room // 4 // ROBOT))
+
+
+def home(size: int) -> jax.Device:
+    """Where `size` bytes can lie beside a copy of them: the first device, or the host's CPU."""
+    room = memory()
+    return jax.devices()[0] if room is None or 2.5 * size <= room else jax.devices("cpu")[0]
 
 
 def spec(axis: int | None) -> PartitionSpec:

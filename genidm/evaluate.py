@@ -38,7 +38,7 @@ class Test:
     Attributes:
       max_steps: an episode ends after this many steps (A.1.3: 1000).
       reach: metres; an episode ends when the target is this near.
-      lanes: robots at once, over all devices.
+      lanes: robots at once, over all devices; an accelerator takes more.
       chunk: steps a program call.
     """
 
@@ -233,7 +233,7 @@ class Testing:
     def start(self) -> Queue:
         """Queues whose lanes are all idle, on the devices."""
         count, share = self.mesh.size, self.share
-        lanes = count * min(-(-self.settings.lanes // count), share)
+        lanes = count * min(-(-devices.at_once(self.settings.lanes) // count), share)
         # One a device at least: jax forgets how an array without elements is shared out.
         rows = count * max(1, -(-self.traced // count))
         shapes = jax.eval_shape(

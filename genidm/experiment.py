@@ -10,6 +10,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from genidm import devices
+from genidm.agents.frozen import Frozen
+from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.errors import BadInput
@@ -54,6 +57,9 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     scale = scale_of(options.scale, robot.paper_interactions)
     if method.agent == PPO():
         method = dataclasses.replace(method, agent=scale.ppo)
+    if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
+        wide: Any = method.agent.wide()  # of the method's own type
+        method = dataclasses.replace(method, agent=wide)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale, seed=options.seed, root=options.out / robot.name,
         test=options.test,
@@ -69,8 +75,12 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
 
 def _fitting(method: Inverse, scale: Scale) -> Inverse:
     """The method as far as a scale's record is long enough for it."""
+    agent = method.agent
+    if isinstance(agent, Frozen):
+        agent = dataclasses.replace(agent, share=max(agent.share, scale.learning))
     return dataclasses.replace(
         method,
+        agent=agent,
         look_ahead=min(method.look_ahead, scale.look_ahead),
         share=max(method.share, scale.share),
     )

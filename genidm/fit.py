@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from genidm import devices
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
 from genidm.generalize import Pairs
@@ -136,7 +137,8 @@ def fit(
 
     Args:
       robot: whose states and actions the samples hold.
-      samples: E, or G = E ∪ 𝒢(E); with a latent they need two views at least.
+      samples: E, or G = E ∪ 𝒢(E); with a latent they need two views at least. They lie on
+        one device while they are learned from: an accelerator if it has the room, else the CPU.
       key: of the parameters and the minibatches.
       settings: networks, losses, schedule.
       frame: the frame that the models see s and d in.
@@ -150,11 +152,12 @@ def fit(
     settings = settings or Fit()
     if settings.latent_size is not None and samples.s.shape[0] < 2:
         raise BadInput("an LFM is fitted to pairs, and these samples have one view only")
-    samples = jax.jit(functools.partial(_framed, robot, frame))(_on_first_device(samples))
+    samples = jax.device_put(samples, devices.home(sum(x.nbytes for x in jax.tree.leaves(samples))))
+    samples = jax.jit(functools.partial(_framed, robot, frame))(samples)
     learner, updates = training(robot, samples, key, settings, frame)
     checkpoints = stage.checkpoints() if stage else None
     found = checkpoints.latest(learner) if checkpoints else None
-    done, learner = (found[0], _on_first_device(found[1])) if found else (0, learner)
+    done, learner = (found[0], _beside(samples, found[1])) if found else (0, learner)
     program = compiled("fit", updates, learner, samples, jnp.int32(0))
     directory = stage.directory if stage else None
     with Progress("fit", settings.updates, "updates", directory, done, quiet) as bar:
@@ -188,9 +191,9 @@ def training(
     return learner, jax.jit(_updates(settings), donate_argnums=0)
 
 
-def _on_first_device(tree: Any) -> Any:
-    # A fit is matrix products, which XLA spreads over the cores by itself.
-    return jax.device_put(tree, jax.devices()[0])
+def _beside(samples: Pairs, tree: Any) -> Any:
+    # One device: a fit is matrix products, which XLA spreads over the cores by itself.
+    return jax.device_put(tree, samples.a.device)
 
 
 def _framed(robot: Robot, frame: Frame, samples: Pairs) -> Pairs:
@@ -211,7 +214,7 @@ def _start(robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: F
         robot=robot,
     )
     state = settings.optimizer().init(model.params)
-    return _on_first_device(Learner(model, state, stream, jnp.zeros((), jnp.int32)))
+    return _beside(samples, Learner(model, state, stream, jnp.zeros((), jnp.int32)))
 
 
 def _updates(settings: Fit) -> Any:

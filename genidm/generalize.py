@@ -42,7 +42,7 @@ class Generalize:
         exactly, without physics.
       segment: steps of a segment, H.
       copies: turned copies of the record.
-      lanes: robots replayed at once.
+      lanes: robots replayed at once; an accelerator takes more.
     """
 
     mode: Mode = "segments"
@@ -190,7 +190,7 @@ class Blocks:
     Args:
       experience: E, `[T, B, ...]`, with its physics.
       settings: mode, segment length and lanes.
-      devices: a block's lanes are a multiple of their number.
+      among: devices that share a block's lanes evenly.
 
     Attributes:
       placed: `[T, B]` bool, where the robot is placed on the record.
@@ -199,7 +199,7 @@ class Blocks:
       follow: whether blocks follow one another.
     """
 
-    def __init__(self, experience: Experience, settings: Generalize, devices: int):
+    def __init__(self, experience: Experience, settings: Generalize, among: int):
         self.placed = _placements(np.asarray(experience.first), settings)
         steps, lanes = self.placed.shape
         self.length = settings.segment
@@ -207,8 +207,8 @@ class Blocks:
         self.steps = steps
         self.follow = settings.mode == "episodes"
         count = self.shape[0] * lanes
-        width = lanes if self.follow else min(settings.lanes, count)
-        self.width = -(-width // devices) * devices
+        width = lanes if self.follow else min(devices.at_once(settings.lanes), count)
+        self.width = -(-width // among) * among
         source = dict(
             physics=experience.physics, s=experience.s, a=experience.a,
             placed=self.placed, valid=experience.valid,

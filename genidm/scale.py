@@ -7,6 +7,9 @@ import dataclasses
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
 
+# Interactions up to which an agent has just begun to learn.
+YOUNG = 400_000
+
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
@@ -19,9 +22,11 @@ class Scale:
       seeds: test seeds.
       episodes: test episodes a seed.
       look_ahead: most steps to the intermediate goal. Agents that have just begun to learn
-        fall so soon that few of their episodes reach further.
+        (`YOUNG`) fall so soon that few of their episodes reach further.
       share: least part of the record that is learned from: in the first half of a short one
         the agent hardly walks.
+      learning: least part of the interactions in which an agent that is frozen afterwards
+        learns: with few of them it needs most to learn to walk at all.
       ppo: stands for PPO at its defaults, which take their time and fall seldom. With few
         interactions more has to be made of each.
     """
@@ -33,6 +38,7 @@ class Scale:
     episodes: int
     look_ahead: int = 1000
     share: float = 0.0
+    learning: float = 0.0
     ppo: PPO = dataclasses.field(default_factory=PPO)
 
 
@@ -50,18 +56,22 @@ def scale_of(text: str, interactions: int) -> Scale:
         return Scale("paper", interactions, 1.0, 10, 1000)
     if text == "quick":
         hurried = PPO(discount=0.97, epochs=7, minibatches=8)
-        return Scale("quick", 240_000, 0.1, 2, 50, look_ahead=50, share=1.0, ppo=hurried)
+        return Scale(
+            "quick", 240_000, 0.1, 2, 50, look_ahead=50, share=1.0, learning=2 / 3, ppo=hurried
+        )
     try:
         share = float(text)
     except ValueError:
         share = 0.0
     if not 0 < share < float("inf"):
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
+    interactions = max(1, round(interactions * share))
     return Scale(
         name=text,
-        interactions=max(1, round(interactions * share)),
+        interactions=interactions,
         updates=min(share, 1.0),
         seeds=10,
         episodes=max(10, round(1000 * min(share, 1.0))),
-        look_ahead=1000 if share > 0.2 else 50,
+        look_ahead=1000 if interactions > YOUNG else 50,
+        learning=2 / 3 if share < 1 else 0.0,
     )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.util
 import json
 import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,7 @@ from experiments.benchmark import collecting, comparing, fitting, sb3, starting,
 from experiments.benchmark.bench import Bench, Options
 from experiments.benchmark.comparing import Row
 from experiments.benchmark.measuring import Probe, interleave, timed
-from experiments.benchmark.rows import ROWS, choose
+from experiments.benchmark.rows import ANT, HUMANOID, ROWS, choose
 from genidm.errors import BadInput
 from genidm.methods import GE, LR
 from genidm.models import Architecture
@@ -57,6 +59,7 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
     monkeypatch.setattr(starting, "starts", lambda bench: both)
     # Neither torch nor Stable-Baselines3 needs to be there, so here they never are.
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(ROWS, "point", ANT)
     results = command.benchmark(Point(), small)
     assert json.loads(small.out.read_text()) == results
     assert all(list(r) == KEYS for r in results)
@@ -67,8 +70,8 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
     assert "pip install" in dict(skipped)["PPO"]
     there = {r["name"].partition(" (")[0]: r for r in results}
     absent = {"MuJoCo in C", "PPO", "PPO of Stable-Baselines3 on gymnasium's Ant-v5"}
-    assert set(there) == {row.name for row in ROWS} - absent
-    compared = {row.name for row in ROWS if row.ratio_to and row.ratio_to != "MuJoCo in C"}
+    assert set(there) == {row.name for row in ANT} - absent
+    compared = {row.name for row in ANT if row.ratio_to and row.ratio_to != "MuJoCo in C"}
     assert {n for n, r in there.items() if r["ratio"] is not None} == compared - absent
     names = {r["name"] for r in results}
     assert {r["ratio_to"] for r in results} <= names | {None}
@@ -76,6 +79,22 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
     assert 0 < there["evaluation, useful"]["ratio"] <= 1
     assert there["evaluation"]["name"] == "evaluation (16 lanes, an untrained controller)"
     assert there["raw MJX, one device"]["name"].endswith("(8 lanes, 1 device)")
+
+
+def test_the_humanoids_rows_on_a_point(small, monkeypatch):
+    monkeypatch.setitem(ROWS, "point", HUMANOID)
+    texts = ("SAC", "fit of LR")
+    results = command.benchmark(Point(), dataclasses.replace(small, rows=texts))
+    ratios = {r["name"].partition(" (")[0]: r["ratio"] for r in results}
+    against_raw = {row.name for row in HUMANOID if row.ratio_to == "raw MJX" and "SAC" in row.name}
+    assert {name for name in against_raw if ratios[name] > 0} == against_raw
+    assert {"SAC, learning", "SAC, frozen", "fit of LR"} <= set(ratios)
+
+
+def test_a_robot_without_rows_and_the_place_of_the_others(ant):
+    with pytest.raises(BadInput, match="rows for ant and humanoid, not for point"):
+        command.benchmark(Point(), Options())
+    assert command.place(ant, Options()) == Path("experiments/results/ant_benchmark.json")
 
 
 def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
@@ -140,19 +159,20 @@ def test_timed_counts_whole_calls():
 
 
 def test_choose_takes_what_a_row_is_compared_with():
-    names = [row.name for row in choose(["two devices"])]
+    names = [row.name for row in choose(["two devices"], ANT)]
     assert names == ["raw MJX, one device", "raw MJX, two devices"]
     # A whole name is that row alone.
-    assert {row.name for row in choose(["raw MJX"])} == {"MuJoCo in C", "raw MJX"}
-    assert choose([]) == list(ROWS)
+    assert {row.name for row in choose(["raw MJX"], ANT)} == {"MuJoCo in C", "raw MJX"}
+    assert choose([], ANT) == list(ANT)
     with pytest.raises(BadInput, match=r"no row is called 'nothing'; there are: MuJoCo in C;"):
-        choose(["nothing"])
+        choose(["nothing"], ANT)
 
 
-def test_rows_name_each_other():
-    names = [row.name for row in ROWS]
+@pytest.mark.parametrize("robot", ROWS)
+def test_rows_name_each_other(robot):
+    names = [row.name for row in ROWS[robot]]
     assert len(set(names)) == len(names)
-    assert {row.ratio_to for row in ROWS} <= {*names, None}
+    assert {row.ratio_to for row in ROWS[robot]} <= {*names, None}
     assert not any(" (" in name for name in names)  # where the table cuts
 
 
@@ -188,7 +208,8 @@ def test_compiling_counts():
 )
 def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
-    monkeypatch.setattr(command, "Ant", Point)
+    monkeypatch.setattr(command, "by_name", lambda name: Point())
+    monkeypatch.setitem(ROWS, "point", ANT)
     monkeypatch.setattr(command, "measure", None)  # not reached
     with pytest.raises(SystemExit) as stop:
         command.main()

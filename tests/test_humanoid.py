@@ -12,7 +12,7 @@ import pytest
 from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from scipy.spatial.transform import Rotation
 
-from genidm.robots import Humanoid
+from genidm.robots import Humanoid, HumanoidWorld
 from genidm.robots.humanoid import POWER
 from genidm.robots.mjx import Physics
 from genidm.tasks import WalkForward
@@ -75,12 +75,12 @@ def one_step(humanoid: Humanoid, starts: Physics) -> tuple[Any, ...]:
     return actions, positive_w(after), contact
 
 
-@pytest.mark.parametrize("frame", ["heading", "world"])
-def test_state_is_read_as_in_c(starts: Physics, frame: Any) -> None:
-    robot = Humanoid(velocity=frame)
+@pytest.mark.parametrize("kind", [Humanoid, HumanoidWorld])
+def test_state_is_read_as_in_c(starts: Physics, kind: type[Humanoid]) -> None:
+    robot = kind()
     state = placed(robot, starts)
     contact = np.zeros((LANES, robot.mj_model.nbody, 6))
-    assert_close(state.observation, observed_in_c(starts, contact, frame), atol=2e-6)
+    assert_close(state.observation, observed_in_c(starts, contact, kind.velocity), atol=2e-6)
     assert_close(state.position, starts.qpos[:, :3], atol=0)
     assert robot.observation.size == 43 and robot.action.size == 17
 
@@ -133,7 +133,7 @@ def test_mirror_commutes_with_physics(
 
 
 def test_world_frame_turns_the_velocity(starts: Physics) -> None:
-    robot, yaw = Humanoid(velocity="world"), np.linspace(-3, 3, LANES).astype(np.float32)
+    robot, yaw = HumanoidWorld(), np.linspace(-3, 3, LANES).astype(np.float32)
     state = placed(robot, starts)
     turned = robot.place(state.physics, jnp.asarray(yaw))
     got = robot.observation.turn(state.observation, yaw)

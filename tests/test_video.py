@@ -23,7 +23,7 @@ from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.experiment import Options, guarded, run_cell
 from genidm.files import save_json
-from genidm.robots import Ant, Humanoid, Logged, remade
+from genidm.robots import Ant, HumanoidWorld, Logged, remade
 from genidm.robots.mjx import Solver
 from genidm.scenarios import scenarios
 from genidm.store import Stage
@@ -143,7 +143,7 @@ def test_numbers_that_cannot_be_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "robot", [Ant(Solver(iterations=6)), Humanoid(Solver(elliptic=False), velocity="world")]
+    "robot", [Ant(Solver(iterations=6)), HumanoidWorld(Solver(elliptic=False))]
 )
 def test_a_robot_is_made_again_from_its_settings(robot, tmp_path: Path) -> None:
     save_json(tmp_path / "experience-0" / "config.json", {"config": {"robot": robot.settings}})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 from typing import Annotated, Any
 
 import jax
@@ -11,11 +12,11 @@ import tyro
 from experiments.benchmark.bench import Bench, Options
 from experiments.benchmark.comparing import measure, table
 from experiments.benchmark.evaluating import controller
-from experiments.benchmark.rows import choose
+from experiments.benchmark.rows import ROWS, choose
 from genidm import files
 from genidm.errors import BadInput
 from genidm.experiment import guarded
-from genidm.robots import Ant, Robot
+from genidm.robots import Robot, by_name
 
 
 def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
@@ -25,21 +26,28 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
       BadInput: unknown rows, lanes that the devices cannot share, a run that is none, or a
         place that cannot be written.
     """
-    rows = choose(options.rows)
+    if robot.name not in ROWS:
+        raise BadInput(f"there are rows for {' and '.join(ROWS)}, not for {robot.name}")
+    rows, out = choose(options.rows, ROWS[robot.name]), place(robot, options)
     for lanes in (options.lanes, options.wide):
         if lanes % jax.device_count():
             raise BadInput(f"{lanes} lanes cannot be shared among {jax.device_count()} devices")
-    with files.disk(options.out):  # before the measuring, not after it
-        if options.out.is_dir():
-            raise BadInput(f"{options.out} is a directory")
-        options.out.parent.mkdir(parents=True, exist_ok=True)
+    with files.disk(out):  # before the measuring, not after it
+        if out.is_dir():
+            raise BadInput(f"{out} is a directory")
+        out.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as exits:
         bench = Bench(robot, options, exits)
         if options.run:
             bench.once(controller)
         results = measure(bench, rows)
-    files.save_json(options.out, results)
+    files.save_json(out, results)
     return results
+
+
+def place(robot: Robot, options: Options) -> Path:
+    """Where the rows are written."""
+    return options.out or Path(f"experiments/results/{robot.name}_benchmark.json")
 
 
 def main() -> None:
@@ -48,7 +56,7 @@ def main() -> None:
     def command(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),  # noqa: B008
     ) -> None:
-        print(table(benchmark(Ant(), options)))
+        print(table(benchmark(by_name(options.robot), options)))
 
     guarded(command, "How fast everything is, as ratios to what limits it.")
 

@@ -28,7 +28,9 @@ class Options:
     """What is measured, and for how long.
 
     Attributes:
-      out: where the rows are written, as JSON.
+      robot: by its name.
+      out: where the rows are written, as JSON; experiments/results/ROBOT_benchmark.json,
+        unless given.
       run: the finished fit stage whose controller is evaluated; an untrained one, unless
         given. It decides how long episodes are, and with that the useful share.
       rows: only the rows of these names, or of which these are a part, and those that they
@@ -39,7 +41,8 @@ class Options:
       bank: test seeds, and episodes for each of them, of the useful share of evaluation.
     """
 
-    out: Path = Path("experiments/results/benchmark.json")
+    robot: str = "ant"
+    out: Path | None = None
     run: Path | None = None
     rows: tuple[str, ...] = ()
     seconds: float = 60.0

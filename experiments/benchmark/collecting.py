@@ -17,6 +17,7 @@ from genidm import devices
 from genidm.agents import ppo
 from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Agent, Iterate, Learning
+from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.off_policy import OffPolicy
 from genidm.collect import CHUNK, collect
 from genidm.experience import Experience, concatenate
@@ -35,6 +36,15 @@ def collecting(bench: Bench, *, method: Method) -> Probe:
     agent = _agent(bench, method)
     learning, learner = _started(bench, method, agent)
     return _iterating(agent, learning.prepare(learner), learner, lambda part: concatenate([part]))
+
+
+def acting(bench: Bench, *, method: Method) -> Probe:
+    """What `collect` does once the agent has learned: it acts, and all is recorded."""
+    assert isinstance(method.agent, Frozen)
+    agent, _, learner = _programs(bench, dataclasses.replace(method, agent=method.agent.agent))
+    frozen = Acting(agent, agent.policy(bench.robot, method.task, learner))
+    learning, lanes = _started(bench, method, frozen)
+    return _iterating(frozen, learning.prepare(lanes), lanes, lambda part: concatenate([part]))
 
 
 def unrecorded(bench: Bench) -> Probe:

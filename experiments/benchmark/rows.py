@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 
-from experiments.benchmark.collecting import collecting, unrecorded, updating, walking, writing
+from experiments.benchmark.collecting import (
+    acting,
+    collecting,
+    unrecorded,
+    updating,
+    walking,
+    writing,
+)
 from experiments.benchmark.comparing import Row
 from experiments.benchmark.evaluating import evaluating, tested
 from experiments.benchmark.fitting import fitting, multiplying
@@ -13,12 +21,23 @@ from experiments.benchmark.others import baseline
 from experiments.benchmark.replaying import generalizing
 from experiments.benchmark.starting import starting
 from experiments.benchmark.stepping import in_c, raw
+from genidm.agents.frozen import Frozen
 from genidm.errors import BadInput
-from genidm.methods import GE, HER_DE, HER_SP, LR, RL, RS, Method
+from genidm.methods import GE, HER_DE, HER_SP, LR, RL, RS, Inverse, Method, by_name
+
+
+def _of_humanoid(name: str) -> Inverse:
+    method = by_name(name, "humanoid")
+    assert isinstance(method, Inverse)
+    return method
+
 
 _P = functools.partial  # one object a build: rows that share it share what it compiles
 _RAW = _P(raw)
 _PPO = _P(collecting, method=RL)
+_WALKER = _of_humanoid("RL")
+assert isinstance(_WALKER.agent, Frozen)
+_SAC: Method = dataclasses.replace(_WALKER, name="SAC", agent=_WALKER.agent.agent)
 
 
 def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
@@ -40,7 +59,14 @@ def _halves(method: Method) -> tuple[Row, Row, Row]:
     return learning, stepping, loop
 
 
-ROWS: tuple[Row, ...] = (
+def _fits(method: Inverse) -> tuple[Row, Row]:
+    """A method's fit beside its matrix products alone."""
+    name, settings = f"fit of {method.name}", method.fit
+    products = Row(f"{name}, products alone", "updates/s", _P(multiplying, settings=settings))
+    return products, Row(name, "updates/s", _P(fitting, settings=settings), products.name)
+
+
+_STEPPING = (
     Row("MuJoCo in C", "steps/s", in_c),
     Row("raw MJX", "steps/s", _RAW, "MuJoCo in C"),
     Row("raw MJX, wide", "steps/s", _P(raw, wide=True), "MuJoCo in C"),
@@ -48,6 +74,16 @@ ROWS: tuple[Row, ...] = (
     Row("raw MJX, two devices", "steps/s", _P(raw, count=2), "raw MJX, one device"),
     Row("raw MJX, all devices", "steps/s", _RAW, "raw MJX, one device"),
     Row("collecting, random actions", "steps/s", _P(collecting, method=RS), "raw MJX"),
+)
+_RUNNING = (
+    Row("𝒢", "steps/s", _P(generalizing), "raw MJX, wide"),
+    Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), "raw MJX, wide"),
+    Row("evaluation", "lane-steps/s", evaluating, "raw MJX, wide"),
+    Row("evaluation, all", "lane-steps", _P(tested, useful=False), rounds=1),
+    Row("evaluation, useful", "lane-steps", _P(tested, useful=True), "evaluation, all", 1),
+)
+ANT: tuple[Row, ...] = (
+    *_STEPPING,
     Row("collecting, PPO", "steps/s", _PPO, "raw MJX"),
     Row("collecting, PPO's stepping alone", "steps/s", _P(walking, method=RL), "raw MJX"),
     Row("PPO, record dropped", "steps/s", unrecorded),
@@ -55,24 +91,29 @@ ROWS: tuple[Row, ...] = (
     Row("writing the record", "steps/s", writing, "collecting, PPO"),
     *_halves(HER_SP),
     *_halves(HER_DE),
-    Row("𝒢", "steps/s", _P(generalizing), "raw MJX, wide"),
-    Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), "raw MJX, wide"),
-    Row("evaluation", "lane-steps/s", evaluating, "raw MJX, wide"),
-    Row("evaluation, all", "lane-steps", _P(tested, useful=False), rounds=1),
-    Row("evaluation, useful", "lane-steps", _P(tested, useful=True), "evaluation, all", 1),
-    Row("fit of LR, products alone", "updates/s", _P(multiplying, settings=LR.fit)),
-    Row("fit of LR", "updates/s", _P(fitting, settings=LR.fit), "fit of LR, products alone"),
-    Row("fit of GE, products alone", "updates/s", _P(multiplying, settings=GE.fit)),
-    Row("fit of GE", "updates/s", _P(fitting, settings=GE.fit), "fit of GE, products alone"),
+    *_RUNNING,
+    *_fits(LR),
+    *_fits(GE),
     Row("PPO of Stable-Baselines3 on gymnasium's Ant-v5", "steps/s", baseline),
     Row("PPO", "steps/s", _PPO, "PPO of Stable-Baselines3 on gymnasium's Ant-v5"),
     *_starts("compiling", "seconds", "s"),
     *_starts("all", "wall", "s"),
     *_starts("compiled", "programs", "programs"),
 )
+HUMANOID: tuple[Row, ...] = (
+    *_STEPPING,
+    *_halves(_SAC),
+    Row("SAC, learning", "steps/s", _P(collecting, method=_SAC), "raw MJX"),
+    Row("SAC, frozen", "steps/s", _P(acting, method=_WALKER), "raw MJX"),
+    *_RUNNING,
+    *_fits(_of_humanoid("LR")),
+    *_fits(_of_humanoid("GE")),
+)
+ROWS = {"ant": ANT, "humanoid": HUMANOID}
+"""Robot → its rows: what its agents are, and what there is to compare with."""
 
 
-def choose(texts: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Row]:
+def choose(texts: Sequence[str], rows: Sequence[Row]) -> list[Row]:
     """The rows that are named, and those they are compared with.
 
     Args:

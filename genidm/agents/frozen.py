@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.off_policy import OffPolicy
 from genidm.agents.policy import Policy, no_statistics
 from genidm.agents.ppo import PPO
 from genidm.agents.sac import SAC
@@ -38,6 +39,11 @@ class Frozen:
     def __post_init__(self) -> None:
         if not 0 < self.share < 1:
             raise BadInput(f"a frozen agent learns for a share in (0, 1), not {self.share}")
+
+    def wide(self) -> Frozen:
+        """The same with a wide agent, where it can be (`OffPolicy.wide`)."""
+        wide = self.agent.wide() if isinstance(self.agent, OffPolicy) else self.agent
+        return dataclasses.replace(self, agent=wide)
 
 
 @dataclasses.dataclass(frozen=True)

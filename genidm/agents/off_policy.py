@@ -11,7 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import flax.struct
 import jax
@@ -21,6 +21,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.types import Transition
 from jax.sharding import Mesh
 
+from genidm import devices
 from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Learning, Metrics
 from genidm.agents.buffer import (
@@ -108,6 +109,13 @@ class OffPolicy(abc.ABC):
             room = f"a buffer for {self.capacity} steps"
             raise BadInput(f"{room} never holds the {self.warmup} of the warmup")
 
+    def wide(self) -> Self:
+        """The same with one step of many robots an iteration, which an accelerator makes at once.
+
+        As many steps lie between updates as before, and the policy that makes them is newer.
+        """
+        return dataclasses.replace(self, lanes=self.lanes * self.unroll, unroll=1)
+
     @abc.abstractmethod
     def algorithm(self, robot: Robot, size: int) -> Algorithm:
         """The learner's networks and losses, for inputs of this size."""
@@ -143,6 +151,7 @@ class OffPolicy(abc.ABC):
             statistics = no_statistics(input_size(robot, task))
             part = jax.eval_shape(walk, statistics, networks.policy, lanes)[2]
             buffer = empty(part, self.capacity)
+            _check_room(buffer)
             return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
         def chosen(training: TrainingState) -> tuple[RunningStatisticsState, Any]:
@@ -202,6 +211,13 @@ class OffPolicy(abc.ABC):
             next_observation=inputs(s_next, after),
             extras={"state_extras": {"truncation": 1.0 * (rows.last & ~verdict.terminal)}},
         )
+
+
+def _check_room(buffer: Buffer) -> None:
+    size, room = sum(x.nbytes for x in jax.tree.leaves(buffer)), devices.memory()
+    if room is not None and 1.2 * size > room:
+        needs = f"the replay buffer needs {size / 1e9:.1f} GB, of {room / 1e9:.1f} on the device"
+        raise BadInput(f"{needs}: give the agent a smaller capacity")
 
 
 def _walk(

@@ -37,14 +37,22 @@ class Networks(flax.struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class SAC(OffPolicy):
-    """Settings of SAC; the temperature is tuned towards an entropy of −A / 2, as Brax does."""
+    """Settings of SAC; the temperature is tuned towards an entropy of −A / 2, as Brax does.
+
+    Attributes:
+      layer_norm: the critics' layers are normalised, which makes more of each update.
+    """
+
+    layer_norm: bool = False
 
     def networks(self, robot: Robot, size: int) -> SACNetworks:
         """Brax's policy and two critics on normalised inputs."""
         distribution = NormalTanhDistribution(event_size=robot.action.size)
         return SACNetworks(
             make_policy_network(distribution.param_size, size, normalize, self.hidden),
-            make_q_network(size, robot.action.size, normalize, self.critic_hidden),
+            make_q_network(
+                size, robot.action.size, normalize, self.critic_hidden, layer_norm=self.layer_norm
+            ),
             distribution,
         )
 

@@ -6,10 +6,10 @@ from typing import Any
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
-from genidm.robots.humanoid import Humanoid
+from genidm.robots.humanoid import Humanoid, HumanoidWorld
 from genidm.robots.logged import Logged
 
-ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid)}
+ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld)}
 
 
 def by_name(name: str) -> Robot:
@@ -49,4 +49,14 @@ def _like(model: Any, value: Any) -> Any:
     return kind(**fields)
 
 
-__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name", "remade"]
+__all__ = [
+    "ROBOTS",
+    "Ant",
+    "Humanoid",
+    "HumanoidWorld",
+    "Logged",
+    "Robot",
+    "State",
+    "by_name",
+    "remade",
+]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -47,11 +47,14 @@ class Humanoid(MjxRobot):
 
     Args:
       solver: of the contacts.
-      velocity: its frame. PyBullet turns it by the yaw, which takes from the LFM some of
-        what it is to learn; "world" leaves that to be learned.
+
+    Attributes:
+      velocity: its frame in s. PyBullet turns it by the yaw, which takes from the LFM some of
+        what it is to learn; `HumanoidWorld` leaves that to be learned.
     """
 
     name = "humanoid"
+    velocity: ClassVar[Frame] = "heading"
     control_step = 0.0165
     standing_height = 1.17
     target_distance = (2.0, 5.0)
@@ -63,16 +66,15 @@ class Humanoid(MjxRobot):
     torque_cost = 0.1
     limit_cost = 0.1
 
-    def __init__(self, solver: Solver | None = None, velocity: Frame = "heading"):
+    def __init__(self, solver: Solver | None = None):
         solver = solver or Solver()
-        self._in_heading = velocity == "heading"
         super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), frames=4)
-        self.settings = {"name": self.name, "solver": solver, "velocity": velocity}
+        self.settings = {"name": self.name, "solver": solver}
         limits = self.mj_model.jnt_range[1:]
         self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])
         m = self.mirror
-        motion = symmetry.heading_vector if self._in_heading else symmetry.vector
+        motion = symmetry.heading_vector if self.velocity == "heading" else symmetry.vector
         angle_and_rate = [2 * hinge + i for hinge in m.hinges for i in (0, 1)]
         self.observation = Layout(
             (
@@ -102,7 +104,7 @@ class Humanoid(MjxRobot):
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         angles = symmetry.euler_of(physics.qpos[3:7])
         velocity = physics.qvel[:3]
-        if self._in_heading:
+        if self.velocity == "heading":
             velocity = symmetry.turn_vector(velocity, -angles[2])
         place = (physics.qpos[7:] - self._middle) / self._reach
         joints = jnp.stack([place, 0.1 * physics.qvel[6:]], axis=-1).reshape(-1)
@@ -118,6 +120,13 @@ class Humanoid(MjxRobot):
         power = self.electricity_cost * jnp.mean(jnp.abs(action * rate), axis=-1)
         torque = self.torque_cost * jnp.mean(action**2, axis=-1)
         return power + torque + self.limit_cost * jnp.sum(jnp.abs(place) > 0.99, axis=-1)
+
+
+class HumanoidWorld(Humanoid):
+    """The Humanoid with its velocity in the world's frame: the harder problem."""
+
+    name = "humanoid_world"
+    velocity = "world"
 
 
 def edited(spec: mujoco.MjSpec) -> mujoco.MjSpec:
