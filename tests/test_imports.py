@@ -21,7 +21,7 @@ config
 files
 checkpoints progress
 store
-robots.base
+robots.base robots.bullet robots.pool
 robots.mjx
 robots.*
 robots

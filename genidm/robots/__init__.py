@@ -5,8 +5,9 @@ from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
 from genidm.robots.humanoid import Humanoid
 from genidm.robots.logged import Logged
+from genidm.robots.minitaur import Minitaur
 
-ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid)}
+ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid, Minitaur)}
 
 
 def by_name(name: str) -> Robot:
@@ -20,4 +21,4 @@ def by_name(name: str) -> Robot:
     return ROBOTS[name]()
 
 
-__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Robot", "State", "by_name"]
+__all__ = ["ROBOTS", "Ant", "Humanoid", "Logged", "Minitaur", "Robot", "State", "by_name"]
