@@ -48,8 +48,9 @@ class Options:
 def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     """The cell that a method and a user's options name."""
     scale = scale_of(options.scale, robot.paper_interactions)
-    if method.agent == PPO():
-        method = dataclasses.replace(method, agent=scale.ppo)
+    if isinstance(method.agent, PPO) and method.agent == PPO(hidden=method.agent.hidden):
+        agent = dataclasses.replace(scale.ppo, hidden=method.agent.hidden)
+        method = dataclasses.replace(method, agent=agent)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale, seed=options.seed, root=options.out / robot.name,
         test=options.test,

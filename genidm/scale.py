@@ -22,8 +22,8 @@ class Scale:
         fall so soon that few of their episodes reach further.
       share: least part of the record that is learned from: in the first half of a short one
         the agent hardly walks.
-      ppo: stands for PPO at its defaults, which take their time and fall seldom. With few
-        interactions more has to be made of each.
+      ppo: stands for PPO at its defaults, whatever its policy's layers, which take their time
+        and fall seldom. With few interactions more has to be made of each.
     """
 
     name: str

@@ -23,7 +23,8 @@ checkpoints progress
 store
 robots.base robots.bullet robots.pool
 robots.mjx
-robots.*
+robots.minitaur robots.ant robots.humanoid robots.logged
+robots.minitaur_env
 robots
 tasks
 experience

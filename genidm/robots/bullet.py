@@ -55,7 +55,10 @@ ENERGY_WEIGHT = 0.005  # of a joule, against a metre
 # Where nothing touches, metres: what lies still there has no contacts.
 ALOFT = 50.0
 
-ROW = {"position": 3, "orientation": 4, "angles": 16, "velocity": 3, "spin": 3, "rates": 16, "heat": 8, "torque": 8}  # fmt: skip
+ROW = {
+    "position": 3, "orientation": 4, "angles": 16, "velocity": 3, "spin": 3, "rates": 16,
+    "heat": 8, "torque": 8,
+}  # fmt: skip
 """All that a step depends on, and how many numbers each takes in a row `[61]`.
 
 Base position (m), orientation (w, x, y, z), joint angles (rad, motors before knees); base
@@ -116,6 +119,24 @@ def motor_torques(
     current = net / RESISTANCE
     given = np.sign(current) * np.interp(np.abs(current), CURRENTS, TORQUES)
     return given, np.clip(observed, -OBSERVED_LIMIT, OBSERVED_LIMIT)
+
+
+def has_fallen(orientation: Any, height: Any) -> Any:
+    """Whether robots with orientations `[..., 4]` and heights `[...]` in metres have fallen."""
+    x, y = orientation[..., 1], orientation[..., 2]
+    return (1 - 2 * (x * x + y * y) < FALLEN_UP) | (height < FALLEN_HEIGHT)
+
+
+def charge(torque: Any, rate: Any) -> Any:
+    """What a control step is charged for energy `[...]`, in the reward's metres.
+
+    0.005 |τ·q̇| dt, where dt is one physics step of the five, the last, as in pybullet_envs.
+
+    Args:
+      torque: `[..., 8]`, as observed, N·m.
+      rate: `[..., 8]`, rad/s.
+    """
+    return ENERGY_WEIGHT * abs((torque * rate).sum(-1)) * SUBSTEP
 
 
 class Simulation:

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import importlib.util
 import json
-import math
 import sys
 from typing import Any, Literal
 
@@ -19,7 +18,7 @@ from genidm import symmetry
 from genidm.errors import BadInput
 from genidm.robots import bullet
 from genidm.robots.base import Robot, State, select
-from genidm.robots.bullet import ENERGY_WEIGHT, FALLEN_HEIGHT, FALLEN_UP, ROW, SUBSTEP, Engine
+from genidm.robots.bullet import ROW, Engine
 from genidm.robots.pool import Pool
 from genidm.symmetry import Layout
 
@@ -182,34 +181,29 @@ class Minitaur(Robot):
         return self._pool.map(np.asarray(rows))
 
     def _state(self, physics: Physics) -> State:
-        x, y = physics.pose[:, 4], physics.pose[:, 5]
-        up = 1 - 2 * (x * x + y * y)
-        fallen = (up < FALLEN_UP) | (physics.pose[:, 2] < FALLEN_HEIGHT)
+        orientation = POSE.part(physics.pose, "orientation")
+        fallen = bullet.has_fallen(orientation, physics.pose[:, 2])
         return State(
             physics=physics,
             observation=self._observe(physics),
             position=physics.pose[:, :3],
-            heading=symmetry.yaw_of(POSE.part(physics.pose, "orientation")),
+            heading=symmetry.yaw_of(orientation),
             fallen=fallen,
             diverged=jnp.zeros_like(fallen),
         )
 
     def _observe(self, physics: Physics) -> jax.Array:
-        known = {}
+        known: dict[str, jax.Array] = {}
         for layout, x in ((POSE, physics.pose), (MOTION, physics.motion), (MOTORS, physics.motors)):
             known |= {f.name: layout.part(x, f.name) for f in layout.fields}
         known["roll, pitch, yaw"] = symmetry.euler_of(known["orientation"])
         return jnp.concatenate([known[f.name] for f in self.observation.fields], axis=-1)
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:
-        """What pybullet_envs charges for energy, a second: 0.005 |τ·q̇| dt of its last dt.
-
-        That is one physics step of the five, and the torque is the one observed.
-        """
+        """What pybullet_envs charges for energy, a second."""
         torque = MOTORS.part(state.physics.motors, "torque")
         rate = MOTION.part(state.physics.motion, "motor velocities")
-        power = jnp.abs(jnp.sum(torque * rate, axis=-1))
-        return ENERGY_WEIGHT * power * SUBSTEP / self.control_step
+        return bullet.charge(torque, rate) / self.control_step
 
 
 def from_rows(rows: jax.Array) -> Physics:
