@@ -52,6 +52,8 @@ EXTENSION_OFFSET = 1.5  # of the leg model: legs stand half bent at action 0
 FALLEN_UP, FALLEN_HEIGHT = 0.85, 0.13  # cosine of the tilt; m
 ENERGY_WEIGHT = 0.005  # of a joule, against a metre
 
+# Metres, rad/s, and so on: beyond, or where there is no number at all, the physics is lost.
+ABSURD = 1e4
 # Where nothing touches, metres: what lies still there has no contacts.
 ALOFT = 50.0
 
@@ -315,7 +317,11 @@ def stepped(simulation: Simulation, row: np.ndarray) -> np.ndarray:
     """State `[61]` one control step after the state and action in `row [69]`."""
     simulation.place(row[:WIDTH])
     simulation.step(row[WIDTH:].astype(np.float64))
-    return simulation.read()
+    after = simulation.read()
+    if not (np.abs(after) < ABSURD).all():
+        # Bullet does not get over it by itself: it would go on among its contacts.
+        simulation.reset()
+    return after
 
 
 def send(sink: int, rows: np.ndarray) -> None:
