@@ -10,13 +10,19 @@ that makes both sides alike.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
+import functools
+import inspect
 import json
 import math
 import os
 import select
 import signal
 import sys
+import weakref
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -141,6 +147,38 @@ def charge(torque: Any, rate: Any) -> Any:
     return ENERGY_WEIGHT * abs((torque * rate).sum(-1)) * SUBSTEP
 
 
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Lets nothing through to stdout and stderr: PyBullet greets on both, from C."""
+    flush = ctypes.CDLL(None).fflush
+    flush(None)
+    kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
+        yield
+        flush(None)
+    finally:
+        for stream, was in zip((1, 2), kept, strict=True):
+            os.dup2(was, stream)
+        for file in (*kept, nowhere):
+            os.close(file)
+
+
+class Client:
+    """PyBullet's functions, of one physics server of the many that a process may have."""
+
+    def __init__(self, pybullet: Any, server: int):
+        self._pybullet, self._server = pybullet, server
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._pybullet, name)
+        if inspect.isbuiltin(found):
+            found = functools.partial(found, physicsClientId=self._server)
+        setattr(self, name, found)
+        return found
+
+
 class Simulation:
     """A Minitaur on a plane; it goes on from where it is, as simulations do.
 
@@ -154,11 +192,13 @@ class Simulation:
     """
 
     def __init__(self, engine: Engine | None = None):
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
+        with silence():
+            import pybullet
 
+            server = pybullet.connect(pybullet.DIRECT)
         self.engine = engine or Engine()
-        self.bullet: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self.bullet: Any = Client(pybullet, server)
+        self._end = weakref.finalize(self, pybullet.disconnect, server)
         self.reset()
 
     def reset(self, yaw: float = 0.0) -> None:
@@ -269,8 +309,8 @@ class Simulation:
         )
 
     def close(self) -> None:
-        """Ends the simulation and frees what it holds."""
-        self.bullet.disconnect()
+        """Ends the simulation and frees what it holds; so does letting go of it."""
+        self._end()
 
 
 # ── a worker ────────────────────────────────────────────────────────────────────────────────
@@ -288,7 +328,7 @@ def serve(engine: Engine, patience: float) -> None:
       patience: seconds for a request; the kernel ends a worker that takes longer.
     """
     source, sink = os.dup(0), os.dup(1)
-    without_greeting()
+    os.dup2(2, 1)  # what Bullet may have to say
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who sends
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     simulation, parent = Simulation(engine), os.getppid()
@@ -300,17 +340,6 @@ def serve(engine: Engine, patience: float) -> None:
             return
         send(sink, np.stack([stepped(simulation, row) for row in rows.reshape(count[0], -1)]))
         signal.setitimer(signal.ITIMER_REAL, 0)
-
-
-def without_greeting() -> None:
-    """Imports PyBullet, which says when it was built, and on stdout whenever it is used."""
-    nowhere, errors = os.open(os.devnull, os.O_WRONLY), os.dup(2)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
-    try:
-        import pybullet  # noqa: F401
-    finally:
-        os.dup2(errors, 2)
 
 
 def stepped(simulation: Simulation, row: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
 import functools
 import importlib.util
@@ -219,7 +220,9 @@ def pool(engine: Engine, processes: int | None) -> Pool:
     settings = json.dumps(dataclasses.asdict(engine))
     # -P: the worker's own directory is no place to import from.
     command = [sys.executable, "-P", bullet.__file__, settings, str(PATIENCE)]
-    return Pool(command, bullet.WIDTH, processes, PATIENCE)
+    made = Pool(command, bullet.WIDTH, processes, PATIENCE)
+    atexit.register(made.close)
+    return made
 
 
 assert sum(ROW.values()) == POSE.size + MOTION.size + MOTORS.size
