@@ -38,6 +38,7 @@ from genidm.robots.bullet import (
     stepped,
 )
 from genidm.robots.minitaur import from_rows
+from genidm.robots.pool import cores
 
 ORIGINAL = Engine(iterations=60, self_collision=True, cone=True)
 OURS = Engine()
@@ -280,7 +281,7 @@ def measured(step: Callable[[], Any], pids: list[int], repeats: int) -> dict[str
 def vectorised(lanes: int = 128, repeats: int = 20) -> list[dict[str, Any]]:
     """Lanes shared by 1, 2, 4, … processes: how much faster, and what is lost beside them."""
     rows = []
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= len(os.sched_getaffinity(0))]
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= cores()]
     for processes in counts:
         robot = Minitaur(processes=processes)
         step = jax.jit(robot.step)

@@ -89,6 +89,13 @@ class Worker:
             pipe.close()
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class Pool:
     """Workers that share rows among them; they start when they are first needed.
 
@@ -108,7 +115,7 @@ class Pool:
         self, command: Sequence[str], size: int, workers: int | None = None, patience: float = 30.0
     ):
         self.command, self.size, self.patience = command, size, patience
-        self.workers = workers or len(os.sched_getaffinity(0))
+        self.workers = workers or cores()
         self.replaced = 0
         self._counting = threading.Lock()
         self._threads = ThreadPoolExecutor(self.workers, "rows")
