@@ -24,7 +24,7 @@ from genidm.errors import BadInput
 
 PACKAGES = (
     *("genidm", "numpy", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint"),
-    *("brax", "mujoco", "mujoco-mjx"),
+    *("brax", "mujoco", "mujoco-mjx", "pybullet"),
 )
 
 

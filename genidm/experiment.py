@@ -55,8 +55,9 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     if options.video:
         robot.drawing()  # what cannot be filmed is said before anything is computed
     scale = scale_of(options.scale, robot.paper_interactions)
-    if method.agent == PPO():
-        method = dataclasses.replace(method, agent=scale.ppo)
+    if isinstance(method.agent, PPO) and method.agent == PPO(hidden=method.agent.hidden):
+        agent = dataclasses.replace(scale.ppo, hidden=method.agent.hidden)
+        method = dataclasses.replace(method, agent=agent)
     if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
         wide: Any = method.agent.wide()  # of the method's own type
         method = dataclasses.replace(method, agent=wide)

@@ -127,7 +127,26 @@ HUMANOID: Methods = (
 )
 """SAC learns for 5 M interactions, is frozen, and collects 10 M (A.1.2, Table 2)."""
 
-TABLES = {"ant": ANT, "humanoid": HUMANOID, "humanoid_world": HUMANOID}
+_STROLLER = PPO(hidden=(256, 256))
+
+MINITAUR: Methods = (
+    RS,
+    dataclasses.replace(RL, agent=_STROLLER),
+    dataclasses.replace(VGCP, agent=_STROLLER),
+    HER_SP,
+    dataclasses.replace(HER_DE, agent=SAC(her=HER())),
+    dataclasses.replace(GE, agent=_STROLLER),
+    dataclasses.replace(LR, agent=_STROLLER),
+    dataclasses.replace(HF, agent=_STROLLER),
+)
+"""PPO of 256×256 collects, and learns to go to goals (A.1.2, Table 2)."""
+
+TABLES = {
+    "ant": ANT,
+    "humanoid": HUMANOID,
+    "humanoid_world": HUMANOID,
+    "minitaur": MINITAUR,
+}
 """Robot → the methods of its column. A robot without one has the Ant's."""
 
 

@@ -27,8 +27,8 @@ class Scale:
         the agent hardly walks.
       learning: least part of the interactions in which an agent that is frozen afterwards
         learns: with few of them it needs most to learn to walk at all.
-      ppo: stands for PPO at its defaults, which take their time and fall seldom. With few
-        interactions more has to be made of each.
+      ppo: stands for PPO at its defaults, whatever its policy's layers, which take their time
+        and fall seldom. With few interactions more has to be made of each.
     """
 
     name: str

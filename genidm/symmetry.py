@@ -115,6 +115,11 @@ def vector(name: str, unit: str = "m") -> Field:
     return Field(name, 3, "vector", unit, turn_vector, _signed([1, -1, 1]))
 
 
+def pseudovector(name: str, unit: str = "rad/s") -> Field:
+    """A pseudovector in the world frame (an angular velocity)."""
+    return Field(name, 3, "pseudovector", unit, turn_vector, _signed([-1, 1, -1]))
+
+
 def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
     """A pseudovector in the body's own frame (MuJoCo's angular velocity of a free joint)."""
     return Field(name, 3, "pseudovector in the body frame", unit, _keep, _signed([-1, 1, -1]))

@@ -41,7 +41,7 @@ from genidm.files import load_arrays, save_arrays
 from genidm.generalize import Generalize
 from genidm.methods import Inverse, Method, literal
 from genidm.progress import METRICS, Progress, read_metrics
-from genidm.robots import Ant, Humanoid, Robot
+from genidm.robots import Ant, Humanoid, Minitaur, Robot
 from genidm.scale import Scale, scale_of
 from genidm.scenarios import scenarios
 from genidm.store import Stage
@@ -364,7 +364,7 @@ def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch
 
 
 @pytest.mark.parametrize("name", methods.ORDER)
-@pytest.mark.parametrize("robot", [Ant, Humanoid])
+@pytest.mark.parametrize("robot", [Ant, Humanoid, Minitaur])
 def test_every_method_has_a_command(robot: type[Robot], name: str, monkeypatch) -> None:
     asked: list = []
     monkeypatch.setattr(experiment, "main", lambda *args: asked.append(args))

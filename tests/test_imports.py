@@ -21,9 +21,10 @@ config
 files
 checkpoints progress
 store
-robots.base
+robots.base robots.bullet robots.pool
 robots.mjx
-robots.*
+robots.minitaur robots.ant robots.humanoid robots.logged
+robots.minitaur_env
 robots
 tasks
 experience

@@ -8,8 +8,11 @@ from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
 from genidm.robots.humanoid import Humanoid, HumanoidWorld
 from genidm.robots.logged import Logged
+from genidm.robots.minitaur import Minitaur
 
-ROBOTS: dict[str, type[Robot]] = {robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld)}
+ROBOTS: dict[str, type[Robot]] = {
+    robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld, Minitaur)
+}
 
 
 def by_name(name: str) -> Robot:
@@ -55,6 +58,7 @@ __all__ = [
     "Humanoid",
     "HumanoidWorld",
     "Logged",
+    "Minitaur",
     "Robot",
     "State",
     "by_name",

@@ -1,0 +1,394 @@
+"""The Minitaur in PyBullet: what its settings cost, how it walks under them, how turnable it is.
+
+    python -m experiments.minitaur_physics         # minutes; what it says is in docs/physics.md
+    python -m experiments.minitaur_physics --lanes 4
+
+Speeds of a single robot are in CPU time. Those of several processes are in wall time, but for
+the time that a process is ready and does not get a core, so other load matters little.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments.physics import metres, table
+from genidm import files, symmetry
+from genidm.config import environment
+from genidm.errors import BadInput
+from genidm.experiment import guarded
+from genidm.robots import Minitaur
+from genidm.robots.bullet import (
+    ACTIONS,
+    Engine,
+    Simulation,
+    has_fallen,
+    parts,
+    stepped,
+)
+from genidm.robots.minitaur import from_rows
+from genidm.robots.pool import cores
+
+ORIGINAL = Engine(iterations=60, self_collision=True, cone=True)
+OURS = Engine()
+STEPS = 500
+LOOK = (5, 10, 20, 50, 100, 200, 500)
+# Each is shaken for so many control steps before it walks, so that no two walk alike.
+SHAKEN = 5
+# Runs of which the shortest is taken.
+REPEATS = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What is measured.
+
+    Attributes:
+      lanes: robots that a number is the mean or the median of.
+      seed: of shakes, actions and yaws.
+      out: the JSON file.
+    """
+
+    lanes: int = 32
+    seed: int = 0
+    out: Path = Path("experiments/results/minitaur_physics.json")
+
+    def check(self) -> None:
+        """Raises BadInput for what cannot be measured."""
+        if self.lanes < 1:
+            raise BadInput("--lanes must be at least 1")
+
+
+def gait() -> np.ndarray:
+    """Actions `[STEPS, 8]` of a trot at 2 Hz: 0.2 m/s, and it does not fall."""
+    phase = 2 * np.pi * 2 * 0.01 * np.arange(STEPS)[:, None] + np.pi * np.array([0, 1, 1, 0])
+    return np.concatenate([0.3 * np.sin(phase), 0.2 * np.cos(phase) - 0.3], axis=-1)
+
+
+def shakes(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """Actions `[steps, 8]`, uniform."""
+    return rng.uniform(-1, 1, (steps, ACTIONS))
+
+
+# ── jobs, each in a process of its own ──────────────────────────────────────────────────────
+
+
+class OneByOne(Simulation):
+    """Asks and tells Bullet joint by joint, as pybullet_envs does."""
+
+    def _joints(self, joints: list[int]) -> np.ndarray:
+        states = [self.bullet.getJointState(self.body, j)[:2] for j in joints]
+        return np.array(states).T
+
+    def _push(self, torques: np.ndarray) -> None:
+        for joint, torque in zip(self.motors, torques, strict=True):
+            self.bullet.setJointMotorControl2(
+                self.body, joint, self.bullet.TORQUE_CONTROL, force=torque
+            )
+
+
+def hard(engine: Engine, yaw: float, actions: np.ndarray) -> np.ndarray:
+    """o `[T, 3]` after each of the actions, from a hard reset at `yaw`, never placed."""
+    simulation = Simulation(engine)
+    simulation.reset(yaw)
+    return np.array([live(simulation, action)[:3] for action in actions])
+
+
+def placed(engine: Engine, row: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """o `[T, 3]` after each of the actions, as 𝒢 has it: placed anew in float32 at each step."""
+    simulation, positions = Simulation(engine), []
+    for action in actions:
+        row = again(simulation, action, row)
+        positions.append(row[:3])
+    return np.array(positions)
+
+
+def live(simulation: Simulation, action: np.ndarray) -> np.ndarray:
+    """The row after a step of a simulation that goes on."""
+    simulation.step(action)
+    return simulation.read()
+
+
+def again(simulation: Simulation, action: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """The row after a step of a simulation that is placed first."""
+    return stepped(simulation, np.concatenate([row, action]).astype(np.float32))
+
+
+def settled(engine: Engine) -> np.ndarray:
+    """The row of the settled start."""
+    return Simulation(engine).read()
+
+
+def walk(engine: Engine, anew: bool, seed: int) -> list[float]:
+    """One walk: metres ahead, mean height (m), mean pitch (rad), steps until it fell, ms a step."""
+    simulation, rng = Simulation(engine), np.random.default_rng(seed)
+    for action in 0.3 * shakes(rng, SHAKEN):
+        simulation.step(action)
+    row, heights, pitches = simulation.read(), [], []
+    start, began = row[0], time.process_time()
+    for action in gait():
+        row = again(simulation, action, row) if anew else live(simulation, action)
+        x = parts(row)
+        if has_fallen(x["orientation"], x["position"][2]):
+            break
+        w, i, j, k = x["orientation"]
+        heights.append(row[2])
+        pitches.append(np.arcsin(2 * (w * j - k * i)))
+    spent = 1e3 * (time.process_time() - began) / len(heights)
+    return [row[0] - start, np.mean(heights), np.mean(pitches), len(heights), spent]
+
+
+def cost(engine: Engine, batched: bool) -> float:
+    """ms of CPU that a control step of a walking robot takes."""
+    simulation = (Simulation if batched else OneByOne)(engine)
+    began = time.process_time()
+    for action in gait()[:100]:
+        simulation.step(action)
+    return 1e3 * (time.process_time() - began) / 100
+
+
+class Jobs:
+    """Functions of this module run on all cores, each job in a process that PyBullet may fill."""
+
+    def __init__(self, processes: int | None = None):
+        self._pool = ProcessPoolExecutor(processes, get_context("spawn"))
+
+    def __call__(self, job: Callable[..., Any], *columns: Any) -> np.ndarray:
+        """Results `[n, ...]` of n jobs, whose arguments stand in columns."""
+        return np.array(list(self._pool.map(job, *columns)))
+
+
+# ── the tables ──────────────────────────────────────────────────────────────────────────────
+
+
+def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
+    """How far a turned replay is from the replay, turned: a row for each start, cone and action."""
+    rng, rows = np.random.default_rng(options.seed), []
+    yaw = rng.uniform(-np.pi, np.pi, options.lanes)
+    told = {
+        "trot": [gait()] * options.lanes,
+        "random": [shakes(rng, STEPS) for _ in range(options.lanes)],
+    }
+    for cone in (False, True):
+        engine = [dataclasses.replace(OURS, cone=cone)] * options.lanes
+        for start in ("hard reset", "placed"):
+            for name, actions in told.items():
+                straight, turned = replays(jobs, start, engine, yaw, actions)
+                exact = symmetry.turn_vector(jnp.asarray(straight), jnp.asarray(yaw)[:, None])
+                apart = np.linalg.norm(np.asarray(exact) - turned, axis=-1)[:, np.array(LOOK) - 1]
+                rows.append(
+                    {
+                        "cone": cone, "start": start, "actions": name, "steps": LOOK,
+                        "median": np.median(apart, axis=0), "p90": np.quantile(apart, 0.9, axis=0),
+                    }
+                )  # fmt: skip
+    return rows
+
+
+def replays(
+    jobs: Jobs, start: str, engine: list[Engine], yaw: np.ndarray, actions: list[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """o `[lanes, T, 3]`, from yaw 0 and from `yaw [lanes]`."""
+    if start == "hard reset":
+        return (jobs(hard, engine, way, actions) for way in (0 * yaw, yaw))
+    row = jobs(settled, engine[:1])[0]
+    physics = jax.tree.map(
+        lambda x: jnp.tile(x, (len(yaw), 1)), from_rows(jnp.asarray(row, jnp.float32))
+    )
+    robot = Minitaur(engine[0])
+    turned = (robot.turn_physics(physics, jnp.asarray(way)) for way in (0 * yaw, yaw))
+    starts = (np.concatenate(jax.tree.leaves(jax.device_get(p)), axis=-1) for p in turned)
+    return (jobs(placed, engine, list(rows), actions) for rows in starts)
+
+
+WALKERS = {
+    "pybullet_envs' settings, live": (ORIGINAL, False),
+    "the same, placed anew at each step": (ORIGINAL, True),
+    "no self-collision, live": (dataclasses.replace(ORIGINAL, self_collision=False), False),
+    "no self-collision, no cone, live": (OURS, False),
+    "ours: the same, placed anew at each step": (OURS, True),
+    "ours, 30 iterations": (dataclasses.replace(OURS, iterations=30), True),
+    "ours, 20 iterations": (dataclasses.replace(OURS, iterations=20), True),
+    "ours, 10 iterations": (dataclasses.replace(OURS, iterations=10), True),
+}
+
+
+def fidelity(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
+    """The same walk under other settings: mean and standard error over the lanes."""
+    rows, names = [], ("ahead", "height", "pitch", "steps", "ms")
+    seeds = [options.seed + lane for lane in range(options.lanes)]
+    for name, (engine, anew) in WALKERS.items():
+        walks = jobs(walk, [engine] * len(seeds), [anew] * len(seeds), seeds)
+        error = walks.std(0) / np.sqrt(len(walks))
+        means = dict(zip(names, zip(walks.mean(0), error, strict=True), strict=True))
+        rows.append({"setting": name, "engine": engine, "placed": anew, **means})
+    return rows
+
+
+def calls(jobs: Jobs) -> list[dict[str, Any]]:
+    """ms of CPU a control step: batched calls on and off, self-collision on and off.
+
+    The least of some runs, which take turns, one at a time: other load can but add to it.
+    """
+    kinds = [(collides, batched) for collides in (True, False) for batched in (False, True)]
+    engines = [dataclasses.replace(OURS, self_collision=collides) for collides, _ in kinds]
+    spent = [
+        [
+            jobs(cost, [engine], [batched])[0]
+            for engine, (_, batched) in zip(engines, kinds, strict=True)
+        ]
+        for _ in range(REPEATS)
+    ]
+    return [
+        {"self_collision": collides, "batched": batched, "ms": ms}
+        for (collides, batched), ms in zip(kinds, np.min(spent, axis=0), strict=True)
+    ]
+
+
+# ── processes ───────────────────────────────────────────────────────────────────────────────
+
+
+def busy(pids: list[int]) -> np.ndarray:
+    """Seconds that each process has run, or waited for a core: the kernel's schedstat."""
+    stats = [Path(f"/proc/{pid}/schedstat").read_text().split() for pid in pids]
+    return np.array([[int(x) for x in s[:2]] for s in stats]).T / 1e9
+
+
+def measured(step: Callable[[], Any], pids: list[int], repeats: int) -> dict[str, float]:
+    """Of so many calls: seconds of wall, of the slowest worker in each, and of CPU in all."""
+    wall = slowest = cpu = 0.0
+    for _ in range(repeats):
+        before, began = busy(pids), time.perf_counter()
+        step()
+        wall += time.perf_counter() - began
+        spent = busy(pids) - before
+        slowest += spent.sum(0).max()
+        cpu += spent[0].sum()
+    return {"wall": wall, "slowest": slowest, "cpu": cpu}
+
+
+def vectorised(lanes: int = 128, repeats: int = 20) -> list[dict[str, Any]]:
+    """Lanes shared by 1, 2, 4, … processes: how much faster, and what is lost beside them."""
+    rows = []
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= cores()]
+    for processes in counts:
+        robot = Minitaur(processes=processes)
+        step = jax.jit(robot.step)
+        state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
+        action = jnp.tile(jnp.asarray(gait()[0], jnp.float32), (lanes, 1))
+        step(state, action).position.block_until_ready()
+        pids = [w.process.pid for w in robot._pool._idle.queue if w]
+
+        def once(step: Any = step, state: Any = state, action: Any = action) -> None:
+            step(state, action).position.block_until_ready()
+
+        rows.append(summary("Minitaur", processes, lanes, repeats, measured(once, pids, repeats)))
+    return rows + [gymnasium_row(processes, 200) for processes in counts]
+
+
+def gymnasium_row(processes: int, repeats: int) -> dict[str, Any]:
+    """The same of gymnasium's AsyncVectorEnv, an environment a process."""
+    from gymnasium.vector import AsyncVectorEnv
+
+    from genidm.robots.minitaur_env import MinitaurEnv
+
+    env = AsyncVectorEnv([MinitaurEnv] * processes, context="forkserver")
+    env.reset()
+    pids = [process.pid for process in env.processes]
+    actions = iter(np.tile(gait()[:, None], (1, processes, 1)).astype(np.float32))
+    row = measured(lambda: env.step(next(actions)), pids, repeats)
+    env.close()
+    return summary("AsyncVectorEnv", processes, processes, repeats, row)
+
+
+def summary(
+    name: str, processes: int, lanes: int, repeats: int, row: dict[str, float]
+) -> dict[str, Any]:
+    """Steps a second of wall, of the slowest worker, of CPU, and the share beside the slowest."""
+    steps = lanes * repeats
+    return {
+        "what": name, "processes": processes, "lanes": lanes,
+        "steps_per_second": steps / row["wall"],
+        "ms_cpu": 1e3 * row["cpu"] / steps,
+        "over_slowest": row["wall"] / row["slowest"] - 1,
+    }  # fmt: skip
+
+
+# ── print ───────────────────────────────────────────────────────────────────────────────────
+
+
+def drift_table(rows: list[dict[str, Any]]) -> str:
+    """Median (90th percentile), metres."""
+    lines = []
+    for r in rows:
+        cells = [f"{metres(m)} ({metres(p)})" for m, p in zip(r["median"], r["p90"], strict=True)]
+        cone = "cone" if r["cone"] else "no cone"
+        lines.append([f"{r['actions']}, {cone}, {r['start']}", *cells])
+    return table(["metres after steps:", *(str(n) for n in LOOK)], lines)
+
+
+def fidelity_table(rows: list[dict[str, Any]]) -> str:
+    """Means ± standard errors."""
+    digits = {"ahead": 3, "height": 4, "pitch": 4, "steps": 0, "ms": 2}
+
+    def cells(r: dict[str, Any]) -> list[str]:
+        shown = [f"{r[n][0]:.{d}f} ± {r[n][1]:.{d}f}" for n, d in digits.items() if n != "ms"]
+        return [r["setting"], *shown, f"{r['ms'][0]:.2f}"]
+
+    head = ["setting", "ahead, m", "height, m", "pitch, rad", "steps of 500", "ms CPU a step"]
+    return table(head, [cells(r) for r in rows])
+
+
+def calls_table(rows: list[dict[str, Any]]) -> str:
+    """CPU time by kind of call."""
+    word = {True: "on", False: "off"}
+    lines = [[word[r["self_collision"]], word[r["batched"]], f"{r['ms']:.2f}"] for r in rows]
+    return table(["self-collision", "batched calls", "ms CPU a step"], lines)
+
+
+def processes_table(rows: list[dict[str, Any]]) -> str:
+    """Speed, its ratio to one process, and overhead."""
+    one = {r["what"]: r["steps_per_second"] for r in rows if r["processes"] == 1}
+    lines = [
+        [
+            r["what"], str(r["processes"]), str(r["lanes"]), f"{r['steps_per_second']:.0f}",
+            f"{r['steps_per_second'] / one[r['what']]:.2f}", f"{r['ms_cpu']:.2f}",
+            f"{100 * r['over_slowest']:.0f} %",
+        ]
+        for r in rows
+    ]  # fmt: skip
+    head = ["what", "processes", "lanes", "steps/s", "ratio", "ms CPU a step", "over the slowest"]
+    return table(head, lines)
+
+
+def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None:
+    """Measures, prints the tables and writes the JSON."""
+    options.check()
+    Minitaur()  # or says what to install
+    before = os.getloadavg()[0]
+    jobs, results = Jobs(), dict[str, Any]()
+    for name, rows, show in (
+        ("processes", vectorised, processes_table),
+        ("calls", lambda: calls(jobs), calls_table),
+        ("fidelity", lambda: fidelity(jobs, options), fidelity_table),
+        ("drift", lambda: drift(jobs, options), drift_table),
+    ):
+        results[name] = rows()
+        print(show(results[name]), end="\n\n", flush=True)
+    load = [before, os.getloadavg()[0]]
+    files.save_json(options.out, {"options": options, "load": load, **results, **environment()})
+
+
+if __name__ == "__main__":
+    guarded(minitaur_physics, "Speed, fidelity and turnability of the Minitaur in PyBullet.")

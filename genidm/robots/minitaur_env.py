@@ -1,0 +1,76 @@
+"""The Minitaur as a `gymnasium.Env`, for other learners than those of this package.
+
+env = gymnasium.vector.AsyncVectorEnv([MinitaurEnv] * 8)   # a process each
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+from genidm.robots.bullet import ACTIONS, Engine, Simulation, charge, has_fallen, parts
+from genidm.robots.minitaur import OBSERVATIONS, Observed
+
+
+class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One Minitaur that is rewarded for walking towards +x, as in pybullet_envs.
+
+    The reward of a step is Δx − 0.005 |τ·q̇| dt, dt being one physics step; the episode
+    ends with a fall, and has no time limit (`gymnasium.wrappers.TimeLimit`). Observations
+    and actions are those of `genidm.robots.Minitaur`, and so is the motion, but for the
+    contacts that Bullet keeps from one step to the next: nothing is placed anew here.
+
+    Args:
+      engine: settings of Bullet.
+      observed: s, "paper17" or "native28".
+    """
+
+    def __init__(self, engine: Engine | None = None, observed: Observed = "paper17"):
+        self.simulation = Simulation(engine)
+        self._observed = observed
+        size = OBSERVATIONS[observed].size
+        self.observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = Box(-1.0, 1.0, (ACTIONS,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """A hard reset.
+
+        Args:
+          seed: has no effect: all starts are alike.
+          options: "yaw", radians, that the start faces (0); or "row" `[61]`, a state to be
+            placed in (`genidm.robots.bullet.ROW`).
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        self.simulation.reset(options.get("yaw", 0.0))
+        if "row" in options:
+            self.simulation.place(options["row"])
+        return self._observe(parts(self.simulation.read())), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        before = self.simulation.read()[0]
+        self.simulation.step(np.asarray(action, np.float64))
+        row = self.simulation.read()
+        x = parts(row)
+        reward = x["position"][0] - before - charge(x["torque"], x["rates"][:8])
+        fallen = bool(has_fallen(x["orientation"], x["position"][2]))
+        return self._observe(x), float(reward), fallen, False, {"row": row}
+
+    def _observe(self, x: dict[str, np.ndarray]) -> np.ndarray:
+        angles, rates = x["angles"][:8], x["rates"][:8]
+        orientation = x["orientation"]
+        if self._observed == "native28":
+            upright = orientation * (-1 if orientation[0] < 0 else 1)
+            s = [angles, rates, x["torque"], upright]
+        else:
+            euler = self.simulation.bullet.getEulerFromQuaternion(np.roll(orientation, -1))
+            s = [angles, x["velocity"], x["spin"], euler]
+        return np.concatenate(s).astype(np.float32)
+
+    def close(self) -> None:
+        self.simulation.close()

@@ -1,0 +1,190 @@
+"""Rows of numbers through worker processes: each row in, one row out, whoever works on it.
+
+A worker holds nothing that a row needs, so that a crash loses nothing: its rows are given to
+another. Workers are plain programs that talk over pipes: they import neither the caller's
+script nor jax, and they end when the pipe does, however this process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import select
+import subprocess
+import threading
+import time
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+# Rows given to a worker at once: some, for the pipe costs a tenth of a millisecond, but not
+# so many that the others wait for the last one.
+MOST_ROWS = 16
+# Seconds that a worker may take to load its model.
+START_SECONDS = 120.0
+
+
+class Lost(Exception):
+    """A worker died, or did not answer in time."""
+
+
+class Worker:
+    """A process that answers rows of float32.
+
+    Its first answer, `greeting [out]`, comes by itself. A request is an int32 n and n rows.
+
+    Args:
+      command: the program and its arguments.
+      size: numbers in an answered row.
+    """
+
+    def __init__(self, command: Sequence[str], size: int):
+        # One thread each: there are as many workers as cores.
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, bufsize=0, env=environment
+        )
+        assert self.process.stdin and self.process.stdout
+        self._sink, self._source = self.process.stdin.fileno(), self.process.stdout.fileno()
+        self._size = size
+        self.greeting = self._receive(1, START_SECONDS)[0]
+
+    def exchange(self, rows: np.ndarray, patience: float) -> np.ndarray:
+        """Answers `[n, out]` to `rows [n, in]`.
+
+        Raises:
+          Lost: there is none within `patience` seconds.
+        """
+        data = np.int32(len(rows)).tobytes() + rows.astype(np.float32).tobytes()
+        try:
+            while data:
+                data = data[os.write(self._sink, data) :]
+        except OSError as error:
+            raise Lost from error
+        return self._receive(len(rows), patience)
+
+    def _receive(self, count: int, patience: float) -> np.ndarray:
+        size, data = 4 * count * self._size, b""
+        deadline = time.monotonic() + patience
+        ready = select.poll()
+        ready.register(self._source, select.POLLIN)
+        while len(data) < size:
+            left = max(0.0, deadline - time.monotonic())
+            part = os.read(self._source, size - len(data)) if ready.poll(1000 * left) else b""
+            if not part:
+                raise Lost
+            data += part
+        return np.frombuffer(data, np.float32).reshape(count, self._size)
+
+    def kill(self) -> None:
+        """Ends the process at once."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe
+            pipe.close()
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class Pool:
+    """Workers that share rows among them; they start when they are first needed.
+
+    Safe to use from several threads at once.
+
+    Args:
+      command: the program that a worker runs, and its arguments.
+      size: numbers in an answered row.
+      workers: how many; one for each core that this process may use, unless given.
+      patience: seconds that a worker may take for a request.
+
+    Attributes:
+      replaced: workers that died or hung, and were replaced.
+    """
+
+    def __init__(
+        self, command: Sequence[str], size: int, workers: int | None = None, patience: float = 30.0
+    ):
+        self.command, self.size, self.patience = command, size, patience
+        self.workers = workers or cores()
+        self.replaced = 0
+        self._counting = threading.Lock()
+        self._threads = ThreadPoolExecutor(self.workers, "rows")
+        # None stands for a worker that has not been started.
+        self._idle: queue.LifoQueue[Worker | None] = queue.LifoQueue()
+        for _ in range(self.workers):
+            self._idle.put(None)
+
+    def greeting(self) -> np.ndarray:
+        """What workers say first, `[out]`."""
+        worker = self._idle.get()
+        try:
+            worker = worker or self._start()
+            return worker.greeting
+        finally:
+            self._idle.put(worker)
+
+    def map(self, rows: np.ndarray) -> np.ndarray:
+        """Answers `[n, out]` to `rows [n, in]`, in their order.
+
+        A row that costs a worker its life is answered by NaN; the others are not touched.
+        """
+        size = min(MOST_ROWS, -(-len(rows) // (2 * self.workers)))
+        parts = [rows[i : i + size] for i in range(0, len(rows), size)]
+        return np.concatenate([*self._threads.map(self._answer, parts)])
+
+    def _answer(self, rows: np.ndarray) -> np.ndarray:
+        try:
+            return self._exchange(rows)
+        except Lost:
+            return np.concatenate([self._alone(row[None]) for row in rows])
+
+    def _alone(self, row: np.ndarray) -> np.ndarray:
+        try:
+            return self._exchange(row)
+        except Lost:
+            return np.full((1, self.size), np.nan, np.float32)
+
+    def _exchange(self, rows: np.ndarray) -> np.ndarray:
+        worker = self._idle.get()
+        try:
+            worker = worker or self._start()
+            return worker.exchange(rows, self.patience)
+        except Lost:
+            assert worker
+            worker.kill()
+            worker = None
+            self._count(len(rows))
+            raise
+        finally:
+            self._idle.put(worker)
+
+    def _start(self) -> Worker:
+        try:
+            return Worker(self.command, self.size)
+        except Lost:
+            # Not to be mended by another worker.
+            raise RuntimeError(f"a worker does not start: {' '.join(self.command)}") from None
+
+    def _count(self, rows: int) -> None:
+        with self._counting:
+            self.replaced += 1
+            said = f"worker {self.replaced} to be lost had {rows} rows; another takes its place"
+        warnings.warn(said, RuntimeWarning, stacklevel=2)
+
+    def close(self) -> None:
+        """Ends all workers that are idle, and takes no more rows."""
+        self._threads.shutdown()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                if worker := self._idle.get_nowait():
+                    worker.kill()

@@ -1,0 +1,110 @@
+"""Rows through worker processes that die, hang, or are killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from genidm.robots.pool import Pool
+
+STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in.py"))]
+
+
+@pytest.fixture
+def make() -> Iterator[Callable[..., Pool]]:
+    made: list[Pool] = []
+
+    def pool(*flags: str, **settings) -> Pool:
+        made.append(Pool([*STAND_IN, *flags], 1, **({"workers": 2} | settings)))
+        return made[-1]
+
+    yield pool
+    for pool_ in made:
+        pool_.close()
+
+
+def rows(count: int) -> np.ndarray:
+    return np.random.default_rng(count).uniform(0, 9, (count, 2)).astype(np.float32)
+
+
+def workers(pool: Pool) -> list[int]:
+    """Process ids of the idle ones."""
+    return [worker.process.pid for worker in pool._idle.queue if worker]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_answers_come_in_order(make: Callable[..., Pool], count: int) -> None:
+    x = rows(count)
+    assert np.array_equal(make().map(x), x.sum(1, keepdims=True))
+
+
+def test_workers_are_started_once(make: Callable[..., Pool]) -> None:
+    pool = make()
+    assert workers(pool) == []
+    assert pool.greeting() == [7]
+    for _ in range(10):
+        pool.map(rows(20))
+    first = set(workers(pool))
+    pool.map(rows(20))
+    assert set(workers(pool)) == first and len(first) <= 2
+
+
+@pytest.mark.parametrize(("number", "patience"), [(13, 30.0), (14, 0.5)])
+def test_a_row_that_costs_its_worker_is_the_only_one_lost(
+    make: Callable[..., Pool], number: int, patience: float
+) -> None:
+    pool, x = make(patience=patience), rows(40)
+    pool.map(x)
+    x[17, 0] = number
+    with pytest.warns(RuntimeWarning, match="another takes its place"):
+        answers = pool.map(x)[:, 0]
+    assert np.flatnonzero(np.isnan(answers)).tolist() == [17]
+    assert np.array_equal(np.delete(answers, 17), np.delete(x.sum(1), 17))
+    assert pool.replaced == 2  # with the rows beside it, and alone
+    assert np.array_equal(pool.map(x[:10])[:, 0], x[:10].sum(1))
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_is_shot_takes_nothing_with_it(
+    make: Callable[..., Pool], blow: signal.Signals
+) -> None:
+    pool, x = make(patience=1.0), rows(40)
+    pool.map(x)
+    for pid in workers(pool):
+        os.kill(pid, blow)
+    with pytest.warns(RuntimeWarning, match="to be lost"):
+        answers = pool.map(x)
+    assert np.array_equal(answers, x.sum(1, keepdims=True))
+    assert 1 <= pool.replaced <= 2
+
+
+def test_a_worker_that_does_not_start_is_an_error(make: Callable[..., Pool]) -> None:
+    pool = make("stillborn")
+    for _ in range(3):  # nobody waits for it, either
+        with pytest.raises(RuntimeError, match=r"does not start.*stand_in\.py stillborn"):
+            pool.map(rows(40))
+
+
+def test_many_may_ask_at_once(make: Callable[..., Pool]) -> None:
+    pool = make()
+    asked = [rows(count) for count in range(1, 60)]
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(pool.map, asked))
+    for x, y in zip(asked, answers, strict=True):
+        assert np.array_equal(y, x.sum(1, keepdims=True))
+
+
+def test_closing_ends_the_workers(make: Callable[..., Pool]) -> None:
+    pool = make()
+    pool.map(rows(40))
+    (first, *_) = workers(pool)
+    pool.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(first, 0)
