@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from bits import same
@@ -380,3 +381,18 @@ def test_settings_that_cannot_be_are_refused() -> None:
     with pytest.raises(BadInput, match="paper17 or native28, not 'all'"):
         Minitaur(observed="all")  # type: ignore[arg-type]
     assert by_name("minitaur").observation.size == 17
+
+
+def test_the_drawing_lies_as_pybullet_has_it(minitaur: Minitaur, starts: State) -> None:
+    model = minitaur.drawing().compile()
+    data, live = mujoco.MjData(model), Simulation()
+    bullet, body = live.bullet, live.body
+    for row, qpos in zip(rows(starts.physics), minitaur.posture(starts.physics), strict=True):
+        live.place(row)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for link in live.motors + live.knees:
+            name = bullet.getJointInfo(body, link)[12].decode()
+            there = bullet.getLinkState(body, link, computeForwardKinematics=1)[4]
+            np.testing.assert_allclose(data.body(name).xpos, there, atol=1e-5)
+    live.close()

@@ -29,6 +29,7 @@ import numpy as np
 
 # ── constants, all of pybullet_envs (bullet/minitaur.py, motor.py, minitaur_gym_env.py) ─────
 
+URDF = "quadruped/minitaur.urdf"  # in pybullet_data
 LEGS = ("front_left", "back_left", "front_right", "back_right")
 MOTORS = [f"motor_{leg}{side}_joint" for leg in LEGS for side in "LR"]
 KNEES = [f"knee_{leg}{side}_link" for leg in LEGS for side in "LR"]
@@ -224,9 +225,7 @@ class Simulation:
         bullet.loadURDF("plane.urdf")
         flags = bullet.URDF_USE_SELF_COLLISION if engine.self_collision else 0
         upright = bullet.getQuaternionFromEuler([0, 0, yaw])
-        self.body = bullet.loadURDF(
-            "quadruped/minitaur.urdf", [0, 0, START_HEIGHT], upright, flags=flags
-        )
+        self.body = bullet.loadURDF(URDF, [0, 0, START_HEIGHT], upright, flags=flags)
         self._find_joints()
         self._set_joints(REST, np.zeros(16))
         self._join_knees()

@@ -8,11 +8,13 @@ import functools
 import importlib.util
 import json
 import sys
+from pathlib import Path
 from typing import Any, Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from genidm import symmetry
@@ -153,6 +155,26 @@ class Minitaur(Robot):
     def _rest(self) -> Physics:
         """The settled start, `[...]` of one robot, at yaw 0."""
         return from_rows(jnp.asarray(self._pool.greeting()))
+
+    def drawing(self) -> mujoco.MjSpec:
+        """PyBullet's own model, as MuJoCo reads it: its boxes and cylinders."""
+        import pybullet_data
+
+        spec = mujoco.MjSpec.from_file(str(Path(pybullet_data.getDataPath()) / bullet.URDF))
+        spec.compiler.fusestatic = False  # the base is a body, and no part of the floor
+        spec.bodies[1].add_freejoint()
+        return spec
+
+    def posture(self, physics: Physics) -> np.ndarray:
+        pose = np.asarray(physics.pose)
+        angles = pose[..., 7:] * np.tile(bullet.DIRECTION, 2)
+        return np.concatenate([pose[..., :7], angles[..., self._drawn]], axis=-1)
+
+    @functools.cached_property
+    def _drawn(self) -> list[int]:
+        """For each hinge of the drawing, which of our joints it is."""
+        model, names = self.drawing().compile(), bullet.MOTORS + bullet.KNEES
+        return [names.index(model.joint(i).name) for i in range(1, model.njnt)]
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
         """The settled start of pybullet_envs, the base given a slight push."""
