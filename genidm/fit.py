@@ -193,7 +193,7 @@ def training(
 
 def _beside(samples: Pairs, tree: Any) -> Any:
     # One device: a fit is matrix products, which XLA spreads over the cores by itself.
-    return jax.device_put(tree, samples.a.device)
+    return jax.device_put(tree, jnp.asarray(samples.a).device)
 
 
 def _framed(robot: Robot, frame: Frame, samples: Pairs) -> Pairs:
