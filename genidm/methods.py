@@ -123,7 +123,8 @@ HUMANOID: Methods = (
     dataclasses.replace(HER_DE, agent=_HER),
     dataclasses.replace(GE, agent=_WALKER),
     dataclasses.replace(LR, agent=_WALKER, fit=_LR_FIT),
-    dataclasses.replace(HF, agent=_WALKER),
+    # The gait is not its own mirror image: fitted to both, HF falls (docs/choices.md).
+    dataclasses.replace(HF, agent=_WALKER, mirror=False),
 )
 """SAC learns for 5 M interactions, is frozen, and collects 10 M (A.1.2, Table 2)."""
 

@@ -12,6 +12,7 @@ import pytest
 from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from scipy.spatial.transform import Rotation
 
+from experiments.humanoid_world import in_world
 from genidm.robots import Humanoid, HumanoidWorld
 from genidm.robots.humanoid import POWER
 from genidm.robots.mjx import Physics
@@ -139,6 +140,14 @@ def test_world_frame_turns_the_velocity(starts: Physics) -> None:
     got = robot.observation.turn(state.observation, yaw)
     assert_close(turned.observation, got, atol=5e-6)
     assert np.abs(turned.observation[:, 1:3] - state.observation[:, 1:3]).max() > 0.1
+
+
+def test_a_record_is_read_as_the_world_has_it(humanoid: Humanoid, starts: Physics) -> None:
+    yaw = jnp.linspace(-3, 3, LANES)
+    turned = humanoid.place(starts, yaw)
+    expected = HumanoidWorld().place(starts, yaw).observation
+    assert_close(in_world(turned.observation), expected, atol=5e-6)
+    assert np.abs(turned.observation - expected).max() > 0.1
 
 
 # ── PyBullet ────────────────────────────────────────────────────────────────────────────────

@@ -1,0 +1,61 @@
+"""The harder problem, velocities in the world's frame: `python -m experiments.humanoid_world`.
+
+What PyBullet tells of a humanoid's velocity is turned by the yaw already, which takes from LFM
+some of what it is to learn. Here the same record is read with the velocity as the world has it:
+the same walks, the same actions, the same 𝒢, another s.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments import table1
+from genidm.cells import InverseCell
+from genidm.experience import Experience
+from genidm.experiment import cell, guarded
+from genidm.methods import by_name
+from genidm.robots import Humanoid, HumanoidWorld
+
+METHODS = ("RL", "GE", "LR")
+
+
+def in_world(s: np.ndarray) -> np.ndarray:
+    """Humanoid states `[..., 43]` as HumanoidWorld has them.
+
+    Turned so that it faces +x a robot reads the same in both frames; turned back, its velocity
+    goes with it in one of them.
+    """
+    heading, world, x = Humanoid().observation, HumanoidWorld().observation, jnp.asarray(s)
+    yaw = heading.yaw(x)
+    return np.asarray(world.turn(heading.turn(x, -yaw), yaw))
+
+
+def record(options: table1.Table) -> Experience:
+    """The Humanoid's record in the place of HumanoidWorld's; collected, unless it is there."""
+    lr = by_name("LR", Humanoid.name)
+    source, target = (cell(robot, lr, options) for robot in (Humanoid(), HumanoidWorld()))
+    assert isinstance(source, InverseCell) and isinstance(target, InverseCell)
+    stage = target.experience_stage
+    if not stage.done:
+        seen = source.experience()
+        seen = seen.replace(s=in_world(seen.s))
+        seen.save(stage.path("experience") / "chunk_00000")
+        stage.finish(source.experience_stage.summary())
+    return target.experience()
+
+
+def main(
+    options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),  # noqa: B008
+) -> None:
+    """Reads the Humanoid's record in the world's frame, then runs the methods on it."""
+    record(options)
+    table1.table1(dataclasses.replace(options, robot=HumanoidWorld.name))
+
+
+if __name__ == "__main__":
+    guarded(main, "The Humanoid with its velocity in the world's frame: RL, GE and LR.")
