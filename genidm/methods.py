@@ -116,7 +116,8 @@ _WALKER = Frozen(_SAC, share=1 / 3)
 _LR_FIT = dataclasses.replace(LR.fit, idm=(256, 256), latent_size=50)
 
 HUMANOID: Methods = (
-    RS,
+    # Moved at random it lies down within 25 steps: farther ahead there is nothing to be seen.
+    dataclasses.replace(RS, look_ahead=10),
     dataclasses.replace(RL, agent=_WALKER),
     dataclasses.replace(VGCP, agent=_SAC),
     dataclasses.replace(HER_SP, agent=_HER),
