@@ -70,7 +70,7 @@ def test_an_off_policy_agent_goes_wide_with_as_many_steps_between_updates(accele
     assert (wide.lanes, wide.unroll) == (agent.lanes * agent.unroll, 1)
     assert dataclasses.replace(wide, lanes=agent.lanes, unroll=agent.unroll) == agent
     assert Frozen(agent, 0.5).wide().agent == wide
-    lr, options = methods.by_name("LR", "humanoid"), Options(scale="0.01")
+    lr, options = methods.by_name("LR", "humanoid"), Options()
     ppo = methods.by_name("LR", "ant")
     assert cell(Humanoid(), lr, options).method.agent == lr.agent
     accelerator(80 * GB)
