@@ -311,6 +311,14 @@ def test_paths(tmp_path):
         assert holds(pixels, colour)
 
 
+def test_who_walks_on_for_long_does_not_make_the_others_small(tmp_path):
+    target, line = np.array([[3.0, 0.0]]), np.linspace(0, 1, 99)[:, None]
+    ways = {"GE": [line * target], "LR": [30 * line * target]}
+    fig = report.paths([("seen", ways, target, 0.0)], tmp_path / "paths.png")
+    for ax in fig.axes:
+        assert 3 < ax.get_xlim()[1] < 6
+
+
 def test_many_methods_stand_in_bands(tmp_path):
     names = [*METHODS, "VGCP", "HER_SP"]
     target = np.array([[3.0, 0.0]])

@@ -295,7 +295,8 @@ def _bands(names: Sequence[str]) -> list[list[str]]:
 def _panel(axes: Array, names: Sequence[str], panel: Panel, looks: Mapping[str, Style]) -> None:
     """A row of axes `[columns]`, one a method; those that are left over go."""
     title, ways, targets, heading = panel
-    limits = _square([np.asarray(targets), *itertools.chain(*ways.values())])
+    walked = itertools.chain(*ways.values())
+    limits = _square([np.asarray(targets), *(_near(way, targets) for way in walked)])
     for ax, name in zip(axes, names, strict=False):
         _targets(ax, targets)
         _ways(ax, ways.get(name, ()), looks[name], heading, limits)
@@ -329,6 +330,16 @@ def _ways(
         tip = ways[0][0] + length * np.array([np.cos(heading), np.sin(heading)])
         arrow = {"arrowstyle": "-|>", "color": "black", "linewidth": 1.8, "shrinkA": 0}
         ax.annotate("", tip, ways[0][0], arrowprops=arrow, zorder=6)
+
+
+def _near(way: Array, targets: Array) -> Array:
+    """The points of a way `[n, 2]` not much farther from its start than the farthest target.
+
+    Who misses a target and walks on for a minute would else make all the others small.
+    """
+    way, targets = np.asarray(way), np.asarray(targets)
+    most = 1.5 * np.linalg.norm(targets - way[0], axis=-1).max()
+    return way[np.linalg.norm(way - way[0], axis=-1) <= most]
 
 
 def _square(points: Iterable[Array]) -> tuple[tuple[float, float], tuple[float, float]]:
