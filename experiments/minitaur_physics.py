@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from experiments.physics import metres, table
-from genidm import files, symmetry
+from genidm import devices, files, symmetry
 from genidm.config import environment
 from genidm.errors import BadInput
 from genidm.experiment import guarded
@@ -38,7 +38,6 @@ from genidm.robots.bullet import (
     stepped,
 )
 from genidm.robots.minitaur import from_rows
-from genidm.robots.pool import cores
 
 ORIGINAL = Engine(iterations=60, self_collision=True, cone=True)
 OURS = Engine()
@@ -281,7 +280,7 @@ def measured(step: Callable[[], Any], pids: list[int], repeats: int) -> dict[str
 def vectorised(lanes: int = 128, repeats: int = 20) -> list[dict[str, Any]]:
     """Lanes shared by 1, 2, 4, … processes: how much faster, and what is lost beside them."""
     rows = []
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= cores()]
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= devices.cores()]
     for processes in counts:
         robot = Minitaur(processes=processes)
         step = jax.jit(robot.step)

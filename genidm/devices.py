@@ -34,8 +34,7 @@ def configure() -> None:
     """
     given = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not given and _setting("jax_num_cpu_devices") < 0:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        count = int(os.environ.get("GENIDM_DEVICES", cores or 1))
+        count = int(os.environ.get("GENIDM_DEVICES", cores()))
         # XLA has a thread a core, and a device at work holds one while it waits for others to
         # do parts of its work: with as many devices as cores 𝒢 hung on two cores, for ever.
         os.environ.setdefault("PJRT_NPROC", str(3 * count))
@@ -48,6 +47,11 @@ def configure() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _setting(name: str) -> Any:

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -87,11 +86,6 @@ class Bench:
     def scratch(self) -> Path:
         """A directory that is removed at the end."""
         return Path(self.exits.enter_context(tempfile.TemporaryDirectory(prefix="genidm-")))
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def counted(n: int, what: str) -> str:

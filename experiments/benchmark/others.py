@@ -9,8 +9,9 @@ import sys
 from tqdm.auto import tqdm
 
 from experiments.benchmark import sb3
-from experiments.benchmark.bench import Bench, cores
+from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, Skip, timed
+from genidm import devices
 
 
 def baseline(bench: Bench) -> Probe:
@@ -19,6 +20,6 @@ def baseline(bench: Bench) -> Probe:
     if missing:
         raise Skip(f"{', '.join(missing)} missing: pip install -e '.[benchmark]'")
     say = functools.partial(tqdm.write, file=sys.stderr)
-    setting = sb3.fastest(sb3.candidates(cores()), say)
+    setting = sb3.fastest(sb3.candidates(devices.cores()), say)
     agent = bench.exits.enter_context(sb3.Baseline(*setting))
     return Probe(timed(agent.iterate, agent.steps), agent.note)

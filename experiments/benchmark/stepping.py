@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from experiments.benchmark.bench import Bench, cores, counted
+from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
 from genidm.robots import Robot, State
@@ -23,7 +23,7 @@ def in_c(bench: Bench) -> Probe:
     robot, lanes = bench.robot, bench.options.lanes
     if not isinstance(robot, MjxRobot):
         raise Skip(f"the {robot.name} is no MuJoCo model")
-    model, threads = robot.mj_model, cores()
+    model, threads = robot.mj_model, devices.cores()
     pool = bench.exits.enter_context(Rollout(nthread=threads))
     data = [mujoco.MjData(model) for _ in range(threads)]
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (lanes, STEPS, model.nu))

@@ -20,6 +20,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from genidm.devices import cores
+
 # Rows given to a worker at once: some, for the pipe costs a tenth of a millisecond, but not
 # so many that the others wait for the last one.
 MOST_ROWS = 16
@@ -87,13 +89,6 @@ class Worker:
         for pipe in (self.process.stdin, self.process.stdout):
             assert pipe
             pipe.close()
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class Pool:
