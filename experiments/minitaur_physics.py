@@ -9,7 +9,9 @@ the time that a process is ready and does not get a core, so other load matters 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -47,6 +49,7 @@ LOOK = (5, 10, 20, 50, 100, 200, 500)
 SHAKEN = 5
 # Runs of which the shortest is taken.
 REPEATS = 10
+ROUNDS = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,8 +163,14 @@ def cost(engine: Engine, batched: bool) -> float:
 class Jobs:
     """Functions of this module run on all cores, each job in a process that PyBullet may fill."""
 
-    def __init__(self, processes: int | None = None):
-        self._pool = ProcessPoolExecutor(processes, get_context("spawn"))
+    def __init__(self) -> None:
+        self._pool = ProcessPoolExecutor(devices.cores(), get_context("spawn"))
+
+    def __enter__(self) -> Jobs:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
 
     def __call__(self, job: Callable[..., Any], *columns: Any) -> np.ndarray:
         """Results `[n, ...]` of n jobs, whose arguments stand in columns."""
@@ -264,64 +273,86 @@ def busy(pids: list[int]) -> np.ndarray:
     return np.array([[int(x) for x in s[:2]] for s in stats]).T / 1e9
 
 
-def measured(step: Callable[[], Any], pids: list[int], repeats: int) -> dict[str, float]:
-    """Of so many calls: seconds of wall, of the slowest worker in each, and of CPU in all."""
-    wall = slowest = cpu = 0.0
-    for _ in range(repeats):
-        before, began = busy(pids), time.perf_counter()
-        step()
-        wall += time.perf_counter() - began
-        spent = busy(pids) - before
-        slowest += spent.sum(0).max()
-        cpu += spent[0].sum()
-    return {"wall": wall, "slowest": slowest, "cpu": cpu}
+@dataclasses.dataclass(frozen=True)
+class Vectorised:
+    """Robots that processes step together.
+
+    Attributes:
+      name: of what steps them.
+      lanes: robots.
+      pids: of the processes.
+      step: steps them all once, and waits for it.
+    """
+
+    name: str
+    lanes: int
+    pids: list[int]
+    step: Callable[[], Any]
+
+    def measured(self, repeats: int) -> dict[str, float]:
+        """Steps a second of wall, ms of CPU a step, and the share of wall beside the slowest."""
+        wall = slowest = cpu = 0.0
+        for _ in range(repeats):
+            before, began = busy(self.pids), time.perf_counter()
+            self.step()
+            wall += time.perf_counter() - began
+            spent = busy(self.pids) - before
+            slowest += spent.sum(0).max()
+            cpu += spent[0].sum()
+        steps = self.lanes * repeats
+        return {
+            "steps_per_second": steps / wall,
+            "ms_cpu": 1e3 * cpu / steps,
+            "over_slowest": wall / slowest - 1,
+        }
 
 
-def vectorised(lanes: int = 128, repeats: int = 20) -> list[dict[str, Any]]:
-    """Lanes shared by 1, 2, 4, … processes: how much faster, and what is lost beside them."""
-    rows = []
+def vectorised() -> list[dict[str, Any]]:
+    """1, 2, 4, … processes: how much faster, and what is lost beside them.
+
+    Medians over rounds in which all take their turns: what the machine does meanwhile is
+    shared by all.
+    """
     counts = [n for n in (1, 2, 4, 8, 16) if n <= devices.cores()]
-    for processes in counts:
-        robot = Minitaur(processes=processes)
-        step = jax.jit(robot.step)
-        state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
-        action = jnp.tile(jnp.asarray(gait()[0], jnp.float32), (lanes, 1))
+    with contextlib.ExitStack() as opened:
+        kinds = [ours(n) for n in counts]
+        kinds += [opened.enter_context(gymnasiums(n)) for n in counts]
+        rounds = [[kind.measured(2560 // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
+    return [
+        {"what": kind.name, "processes": len(kind.pids), "lanes": kind.lanes}
+        | {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
+        for kind, rows in zip(kinds, zip(*rounds, strict=True), strict=True)
+    ]
+
+
+def ours(processes: int, lanes: int = 128) -> Vectorised:
+    """Lanes shared by processes."""
+    robot = Minitaur(processes=processes)
+    step = jax.jit(robot.step)
+    state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
+    action = jnp.tile(jnp.asarray(gait()[0], jnp.float32), (lanes, 1))
+
+    def once() -> None:
         step(state, action).position.block_until_ready()
-        pids = [w.process.pid for w in robot._pool._idle.queue if w]
 
-        def once(step: Any = step, state: Any = state, action: Any = action) -> None:
-            step(state, action).position.block_until_ready()
-
-        rows.append(summary("Minitaur", processes, lanes, repeats, measured(once, pids, repeats)))
-    return rows + [gymnasium_row(processes, 200) for processes in counts]
+    once()
+    pids = [w.process.pid for w in robot._pool._idle.queue if w]
+    return Vectorised("Minitaur", lanes, pids, once)
 
 
-def gymnasium_row(processes: int, repeats: int) -> dict[str, Any]:
-    """The same of gymnasium's AsyncVectorEnv, an environment a process."""
+@contextlib.contextmanager
+def gymnasiums(processes: int) -> Iterator[Vectorised]:
+    """gymnasium's AsyncVectorEnv, an environment a process."""
     from gymnasium.vector import AsyncVectorEnv
 
     from genidm.robots.minitaur_env import MinitaurEnv
 
     env = AsyncVectorEnv([MinitaurEnv] * processes, context="forkserver")
     env.reset()
+    actions = itertools.cycle(np.tile(gait()[:, None], (1, processes, 1)).astype(np.float32))
     pids = [process.pid for process in env.processes]
-    actions = iter(np.tile(gait()[:, None], (1, processes, 1)).astype(np.float32))
-    row = measured(lambda: env.step(next(actions)), pids, repeats)
+    yield Vectorised("AsyncVectorEnv", processes, pids, lambda: env.step(next(actions)))
     env.close()
-    return summary("AsyncVectorEnv", processes, processes, repeats, row)
-
-
-def summary(
-    name: str, processes: int, lanes: int, repeats: int, row: dict[str, float]
-) -> dict[str, Any]:
-    """Steps a second of wall, of the slowest worker, of CPU, and the share beside the slowest."""
-    steps = lanes * repeats
-    return {
-        "what": name, "processes": processes, "lanes": lanes,
-        "steps_per_second": steps / row["wall"],
-        "ms_cpu": 1e3 * row["cpu"] / steps,
-        "over_slowest": row["wall"] / row["slowest"] - 1,
-    }  # fmt: skip
 
 
 # ── print ───────────────────────────────────────────────────────────────────────────────────
@@ -376,15 +407,16 @@ def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Optio
     options.check()
     Minitaur()  # or says what to install
     before = os.getloadavg()[0]
-    jobs, results = Jobs(), dict[str, Any]()
-    for name, rows, show in (
-        ("processes", vectorised, processes_table),
-        ("calls", lambda: calls(jobs), calls_table),
-        ("fidelity", lambda: fidelity(jobs, options), fidelity_table),
-        ("drift", lambda: drift(jobs, options), drift_table),
-    ):
-        results[name] = rows()
-        print(show(results[name]), end="\n\n", flush=True)
+    results = dict[str, Any]()
+    with Jobs() as jobs:
+        for name, rows, show in (
+            ("processes", vectorised, processes_table),
+            ("calls", lambda: calls(jobs), calls_table),
+            ("fidelity", lambda: fidelity(jobs, options), fidelity_table),
+            ("drift", lambda: drift(jobs, options), drift_table),
+        ):
+            results[name] = rows()
+            print(show(results[name]), end="\n\n", flush=True)
     load = [before, os.getloadavg()[0]]
     files.save_json(options.out, {"options": options, "load": load, **results, **environment()})
 

@@ -22,11 +22,22 @@ import numpy as np
 
 from genidm.devices import cores
 
-# Rows given to a worker at once: some, for the pipe costs a tenth of a millisecond, but not
-# so many that the others wait for the last one.
+# Rows given to a worker at once: so few that a worker that is lost takes few with it.
 MOST_ROWS = 16
 # Seconds that a worker may take to load its model.
 START_SECONDS = 120.0
+
+
+def portions(count: int, workers: int) -> list[int]:
+    """How many rows are given out at once, in turn, until there are none left of `count`.
+
+    Many at first, for each time costs a tenth of a millisecond; in the end one by one, so
+    that no worker waits long for the last.
+    """
+    sizes: list[int] = []
+    while left := count - sum(sizes):
+        sizes.append(min(MOST_ROWS, -(-left // (2 * workers))))
+    return sizes
 
 
 class Lost(Exception):
@@ -133,8 +144,7 @@ class Pool:
 
         A row that costs a worker its life is answered by NaN; the others are not touched.
         """
-        size = min(MOST_ROWS, -(-len(rows) // (2 * self.workers)))
-        parts = [rows[i : i + size] for i in range(0, len(rows), size)]
+        parts = np.split(rows, np.cumsum(portions(len(rows), self.workers))[:-1])
         return np.concatenate([*self._threads.map(self._answer, parts)])
 
     def _answer(self, rows: np.ndarray) -> np.ndarray:
