@@ -133,8 +133,7 @@ HUMANOID: Methods = (
 _STROLLER = PPO(hidden=(256, 256), entropy=0.0)
 
 MINITAUR: Methods = (
-    # Moved at random it falls within some 50 steps.
-    dataclasses.replace(RS, look_ahead=20),
+    RS,
     dataclasses.replace(RL, agent=_STROLLER),
     dataclasses.replace(VGCP, agent=_STROLLER),
     HER_SP,
