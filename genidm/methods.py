@@ -129,7 +129,7 @@ HUMANOID: Methods = (
 )
 """SAC learns for 5 M interactions, is frozen, and collects 10 M (A.1.2, Table 2)."""
 
-# It never falls while it learns, and with nothing paid for noise its steps become clean ones.
+# It stands by itself, so nothing is paid for noise, which would hide the gait (docs/choices.md).
 _STROLLER = PPO(hidden=(256, 256), entropy=0.0)
 
 MINITAUR: Methods = (
@@ -140,7 +140,7 @@ MINITAUR: Methods = (
     dataclasses.replace(HER_DE, agent=SAC(her=HER())),
     dataclasses.replace(GE, agent=_STROLLER),
     dataclasses.replace(LR, agent=_STROLLER),
-    # Nor is this gait its own mirror image.
+    # This gait leans to one side, too.
     dataclasses.replace(HF, agent=_STROLLER, mirror=False),
 )
 """PPO of 256×256 collects, and learns to go to goals (A.1.2, Table 2)."""
