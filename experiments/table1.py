@@ -28,7 +28,7 @@ class Table(Options):
     """What the whole table takes.
 
     Attributes:
-      robot: by its name.
+      robot: ant, humanoid, humanoid_world or minitaur.
       methods: the rows to make; what lies under `out` already stands in the table, too.
       extra: also the rows that the paper does not have (HF); off, they are left out.
       seeds: how many training seeds, from `seed` on. The first makes the rows; the spread

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from genidm import controller, files
+from genidm import files
 from genidm.config import environment
 from genidm.errors import BadInput
-from genidm.experiment import guarded
+from genidm.experiment import guarded, saved
 from genidm.report import journeys
 from genidm.report.rows import jsonable
-from genidm.store import Stage
 from genidm.waypoints import Follow, Journeys, follow
 
 # Metres. It goes ahead, turns both ways, and comes back facing where it started from.
@@ -46,26 +45,18 @@ def main(
     Raises:
       BadInput: runs of different robots, or none.
     """
-    if not runs:
-        raise BadInput("waypoints need the directory of a run: METHOD-SEED-… under --out of a cell")
+    robot, models = saved(runs)
     if robots < 1:
         raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
     made: dict[str, Journeys] = {}
-    names = set()
-    for run in runs:
-        model = controller.load(run)
-        names.add(model.robot.name)
-        if len(names) > 1:
-            raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(names))}")
-        name = Stage(run).summary()["method"]
-        name = name if name not in made else f"{name}, {run.name}"
+    for name, (model, _) in models.items():
         points = np.asarray(waypoints)
-        made[name] = follow(model.robot, model, points, keys, turned, settings=settings)
+        made[name] = follow(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}
     written = {"waypoints": waypoints, "methods": jsonable(summary, digits=4), **environment()}
-    name = f"{names.pop()}_waypoints"
+    name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", written)
     journeys(made, settings.reach, out / f"{name}.png")
     print(f"Numbers and figure: {out / name}.json, .png")

@@ -62,17 +62,18 @@ class Experience(flax.struct.PyTreeNode):
         there = {name: x for name, x in tree.items() if x is not None}
         files.save_arrays(path, there, {}, overwrite=True)
 
-    def check(self, state_size: int, action_size: int) -> None:
+    def check(self, robot: Robot) -> None:
         """Refuses a record that cannot be learned from.
 
         Raises:
           BadInput: the shapes do not fit together or the robot, numbers are not finite, actions
-            lie outside [−1, 1], or flags are not bool.
+            lie outside [−1, 1], a quaternion in s is none with w ≥ 0, or flags are not bool.
         """
         lanes = np.shape(self.first)
         if len(lanes) != 2:
             raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
-        sizes = {"s": (state_size,), "o": (3,), "o_next": (3,), "a": (action_size,)}
+        state, action = robot.observation, robot.action
+        sizes = {"s": (state.size,), "o": (3,), "o_next": (3,), "a": (action.size,)}
         for name, size in (sizes | {"last": (), "valid": ()}).items():
             shape = np.shape(getattr(self, name))
             if shape != (*lanes, *size):
@@ -85,6 +86,8 @@ class Experience(flax.struct.PyTreeNode):
                 raise BadInput(f"experience: {name} is of {getattr(self, name).dtype}, not bool")
         if np.abs(self.a).max(initial=0.0) > 1 + 1e-6:
             raise BadInput("experience: a lies outside [−1, 1]")
+        for field in state.unsound(np.asarray(self.s)):
+            raise BadInput(f"experience: {field!r} in s is not of length 1 with w ≥ 0 everywhere")
         if any(x.shape[:2] != lanes for x in jax.tree.leaves(self.physics)):
             raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
 
@@ -118,7 +121,7 @@ def load(path: Path, robot: Robot) -> Experience:
     if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
         raise BadInput(f"{path} holds no experience")
     experience = Experience(**tree)
-    experience.check(robot.observation.size, robot.action.size)
+    experience.check(robot)
     if experience.physics is None:
         return experience
     try:

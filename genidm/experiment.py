@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from genidm import devices
+from genidm import controller, devices
 from genidm.agents.frozen import Frozen
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.errors import BadInput
-from genidm.evaluate import Test
+from genidm.evaluate import Steering, Test
 from genidm.methods import Direct, Inverse, literal
 from genidm.robots import Robot
 from genidm.scale import Scale, scale_of
 from genidm.scenarios import Scenarios, scenarios
+from genidm.store import Stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +100,30 @@ def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
     if options.video:
         film_cell(this)
     return write_report(this, tested, options)
+
+
+def saved(runs: Sequence[Path]) -> tuple[Robot, dict[str, tuple[Steering, dict[str, Any]]]]:
+    """Controllers to be compared, from the directories of their runs.
+
+    Returns:
+      their robot; and by the method's name, or where two runs have the same also the run's,
+      the controller and what the run says of it.
+
+    Raises:
+      BadInput: there are none, one is no finished run, or they are of different robots.
+    """
+    if not runs:
+        raise BadInput("give the directory of a run: METHOD-SEED-… under --out of a cell")
+    robots: dict[str, Robot] = {}
+    models: dict[str, tuple[Steering, dict[str, Any]]] = {}
+    for run in runs:
+        summary, model = Stage(run).summary(), controller.load(run)
+        name = summary["method"]
+        models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
+        robots.setdefault(model.robot.name, model.robot)
+    if len(robots) > 1:
+        raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")
+    return next(iter(robots.values())), models
 
 
 def film_cell(this: Cell[Any]) -> None:

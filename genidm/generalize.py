@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -28,6 +29,8 @@ from genidm.robots.base import Robot, State, select
 
 Mode = Literal["segments", "episodes", "rotate"]
 
+# Share of a record that is too little to be learned from without a word.
+FEW = 0.25
 # How d transforms is declared as everything else is.
 DIRECTION = symmetry.vector("direction", unit="1")
 
@@ -133,7 +136,7 @@ def replay(
       BadInput: the record is unusable, or holds no physics and the mode needs it.
     """
     settings = settings or Generalize()
-    experience.check(robot.observation.size, robot.action.size)
+    experience.check(robot)
     if settings.mode == "rotate":
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
@@ -376,7 +379,7 @@ def pairs(
     """
     if look_ahead < 1:
         raise BadInput(f"look_ahead must be at least 1, not {look_ahead}")
-    experience.check(robot.observation.size, robot.action.size)
+    experience.check(robot)
     goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.last), look_ahead))
     ahead = np.take_along_axis(np.asarray(experience.o_next), goal[..., None], axis=0)
     views = [(np.asarray(experience.s), ahead - np.asarray(experience.o))]
@@ -384,6 +387,9 @@ def pairs(
     for copy in _copies(turned):
         views.append((copy.s, _goal(copy, goal, ahead) - copy.o))
         valid = valid & copy.valid
+    if 0 < valid.mean() < FEW:
+        said = f"look_ahead {look_ahead} leaves {valid.sum()} of {valid.size} steps to learn from"
+        warnings.warn(f"{said}: the episodes of the others end sooner", stacklevel=2)
     out = _samples(views, np.asarray(experience.a), valid)
     return with_reflection(robot, out) if mirror else out
 

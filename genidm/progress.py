@@ -29,6 +29,8 @@ FLUSH_SECONDS = 5.0
 def compiled(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
     """Compiles a jitted function ahead of its first call, and says how long that took.
 
+    One that lies in the compilation cache is only traced anew, and read.
+
     Args:
       name: what the function is, for the line on stderr.
       jitted: what `jax.jit` returned.
@@ -40,10 +42,12 @@ def compiled(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
     """
     start = time.perf_counter()
     if sys.stderr.isatty():
-        print(f"compiling {name} …", end="\r", file=sys.stderr, flush=True)
+        print(f"{name}: compiling …", end="\r", file=sys.stderr, flush=True)
     program: Callable[..., Any] = jitted.lower(*args).compile()
     seconds = time.perf_counter() - start
-    tqdm.write(f"compiled {name} in {seconds:.{0 if seconds >= 10 else 1}f} s", file=sys.stderr)
+    tqdm.write(
+        f"{name}: program ready in {seconds:.{0 if seconds >= 10 else 1}f} s", file=sys.stderr
+    )
     return program
 
 

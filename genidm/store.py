@@ -51,7 +51,10 @@ class Stage:
 
     def summary(self) -> Any:
         """What `finish` was given; raises Torn if the stage is not finished."""
-        return load_json(self.path("done.json"))
+        try:
+            return load_json(self.path("done.json"))
+        except Torn as torn:
+            raise Torn(f"{self.directory} is not the directory of a finished run: {torn}") from None
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Marks the stage as finished; the last thing done to it."""

@@ -82,6 +82,7 @@ class Field:
       turn: (x [..., size], yaw [...]) → x after the world is turned by yaw.
       mirror: x [..., size] → x after the reflection y → −y.
       yaw: x [..., size] → heading [...], for a field that holds one.
+      sound: x [..., size] → whether all of it can be such numbers.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Field:
     turn: Turn
     mirror: Mirror
     yaw: Callable[[Array], Array] | None = None
+    sound: Callable[[np.ndarray], bool] | None = None
 
 
 def _signed(signs: Sequence[float], permutation: Sequence[int] | None = None) -> Mirror:
@@ -128,7 +130,12 @@ def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
 def quaternion(name: str) -> Field:
     """An orientation, given with w ≥ 0 because q and −q are one orientation but two inputs."""
     mirror = _signed([1, -1, 1, -1])
-    return Field(name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of)
+    return Field(name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _upright_units)
+
+
+def _upright_units(q: np.ndarray) -> bool:
+    """Whether quaternions `[..., 4]` have length 1, within 1e-3, and w ≥ 0."""
+    return bool((np.abs(np.linalg.norm(q, axis=-1) - 1) < 1e-3).all() and (q[..., 0] >= 0).all())
 
 
 def heading_vector(name: str, unit: str = "m") -> Field:
@@ -206,6 +213,12 @@ class Layout:
     def part(self, x: Array, name: str) -> Array:
         """The field `name` of x `[..., n]`."""
         return dict(zip((f.name for f in self.fields), self._split(x), strict=True))[name]
+
+    def unsound(self, x: np.ndarray) -> list[str]:
+        """Names of fields of which x `[..., n]` holds what they cannot be."""
+        edges = np.cumsum([f.size for f in self.fields])[:-1]
+        parts = zip(self.fields, np.split(x, edges, axis=-1), strict=True)
+        return [f.name for f, part in parts if f.sound is not None and not f.sound(part)]
 
     def turn(self, x: Array, yaw: Array) -> Array:
         """x `[..., n]` after the world is turned by `yaw [...]` about the origin's vertical."""

@@ -332,10 +332,22 @@ def dying(*args, **kwargs):
 
 def test_it_is_tested_again_like_any_controller(direct: Finished, capsys, monkeypatch) -> None:
     monkeypatch.setattr(controller, "by_name", lambda name: Point())
-    evaluate.main(stage_of(direct.out, "VGCP"), seeds=10, episodes=2, test=TEST)
+    evaluate.main((stage_of(direct.out, "VGCP"),), seeds=10, episodes=2, test=TEST)
     mean = direct.results["methods"]["VGCP"]["mean"]
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("VGCP"))
     assert f"{mean:.2f}" in row
+
+
+def test_runs_are_tested_again_side_by_side(direct: Finished, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(controller, "by_name", lambda name: Point())
+    run = stage_of(direct.out, "VGCP")
+    evaluate.main((run, run), seeds=2, episodes=2, test=TEST)
+    shown = capsys.readouterr().out.splitlines()
+    (pair,) = (line.split() for line in shown if line.startswith(f"VGCP, {run.name}-VGCP"))
+    assert float(pair[2]) == 0
+    for wrong, why in (((), "of a run"), ((run / "controller",), "of a finished run")):
+        with pytest.raises(BadInput, match=why):
+            evaluate.main(wrong)
 
 
 def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, monkeypatch) -> None:

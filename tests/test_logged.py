@@ -62,6 +62,11 @@ def test_a_log_becomes_a_controller(tmp_path: Path) -> None:
         controller.load(tmp_path / "run")
 
 
+def test_a_look_ahead_that_leaves_little_is_said() -> None:
+    with pytest.warns(UserWarning, match="look_ahead 50 leaves 33 of 180 steps"):
+        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), look_ahead=50)
+
+
 def test_nothing_can_be_stepped() -> None:
     robot = Mine()
     for call in (robot.reset, robot.step, robot.place, robot.cost):
@@ -76,6 +81,8 @@ def test_nothing_can_be_stepped() -> None:
         (dict(last=log().last.astype(int)), "last is of int64, not bool"),
         (dict(first=log().first[:, 0]), r"first has shape \(60,\), not that of \[steps, lanes\]"),
         (dict(o=log().o[..., :2]), "o has shape"),
+        (dict(s=-log().s), "'orientation' in s is not of length 1 with w ≥ 0"),
+        (dict(s=2 * log().s), "'orientation' in s is not of length 1 with w ≥ 0"),
     ],
 )
 def test_logs_that_are_none_are_refused(changes: dict, why: str) -> None:

@@ -154,7 +154,7 @@ def test_compiling_is_timed_apart(capfd) -> None:
         return 2 * x
 
     program = compiled("doubling", jax.jit(double), jnp.ones(3))
-    assert re.search(r"compiled doubling in \d+(\.\d)? s\n", capfd.readouterr().err)
+    assert re.search(r"doubling: program ready in \d+(\.\d)? s\n", capfd.readouterr().err)
     np.testing.assert_array_equal(program(jnp.arange(3.0)), [0, 2, 4])
     assert len(traces) == 1
     with pytest.raises(TypeError):

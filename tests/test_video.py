@@ -31,7 +31,7 @@ from genidm.video import Film, Shot, Take, backends, clip, shooting
 from genidm.video.__main__ import main
 from genidm.video.filming import LONGEST, robot_of
 from genidm.video.pages import FPS, contents
-from genidm.video.scenery import REACHED, TO_GO
+from genidm.video.scenery import FLOOR_NAME, REACHED, TO_GO, scene
 from genidm.waypoints import Follow
 
 
@@ -199,6 +199,16 @@ def test_every_geom_is_where_mujoco_has_it() -> None:
             np.testing.assert_allclose(body[:3], data.xpos[model.geom_bodyid[i]], atol=6e-4)
             mujoco.mju_rotVecQuat(point, np.array(geom["place"]), body[3:])
             np.testing.assert_allclose(body[:3] + point, data.geom_xpos[i], atol=1e-3)
+
+
+def test_the_floor_stays_under_what_comes_from_a_urdf() -> None:
+    """MuJoCo leaves out of a URDF what nothing collides with."""
+    urdf = """<robot name="block"><link name="block">
+      <inertial><mass value="1"/>
+        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+      <collision><geometry><box size="1 1 1"/></geometry></collision></link></robot>"""
+    model = scene(mujoco.MjSpec.from_string(urdf), 64, 64)
+    assert model.geom(FLOOR_NAME).type == mujoco.mjtGeom.mjGEOM_PLANE and model.ntex == 1
 
 
 def test_every_kind_of_geom_is_shown_and_a_mesh_as_its_box() -> None:
@@ -395,9 +405,11 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     beside = inside(path.read_text())
     assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
-    main(path.parent, (tmp_path / "again.html",), seconds=LONGEST)
+    main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)
     assert inside((tmp_path / "again.html").read_text()) == beside  # found by its run alone
-    main(path.parent, (tmp_path / "way.html",), (4, 1), waypoints=((9.0, 0.0), (0.0, 9.0)))
+    main((path.parent,), (tmp_path / "way.html",), (4, 1), waypoints=((9.0, 0.0), (0.0, 9.0)))
+    with pytest.raises(BadInput, match="of one run"):
+        main((path.parent,) * 2)
     way = inside((tmp_path / "way.html").read_text())
     assert [take["waypoints"] for take in way["takes"]] == [[[9, 0, 0.5], [0, 9, 0.5]]] * 2
     assert way["reach"] == Follow.reach and "way.html" in capsys.readouterr().out

@@ -8,13 +8,14 @@ from typing import Annotated, Any
 import tyro
 
 from genidm import video
+from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.video.filming import LONGEST
 from genidm.waypoints import Follow
 
 
 def main(
-    run: Annotated[Path, tyro.conf.Positional],
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: tuple[Path, ...] = (),
     episodes: tuple[int, ...] = (),
     waypoints: tuple[tuple[float, float], ...] = (),
@@ -28,12 +29,14 @@ def main(
     """Films a controller in episodes of the test (A.1.3), or on its way through waypoints.
 
     Args:
-      run: directory of a fit or a baseline (METHOD-SEED-…), as a cell leaves it under --out.
+      runs: one directory of a fit or a baseline (METHOD-SEED-…), as a cell leaves it under
+        --out.
       out: files to write: .gif, .mp4 (needs the extra `video`), or .html, a page that can be
         turned and played and needs no renderer; runs/video/ROBOT-RUN.gif, unless given.
       episodes: numbers of the test's episodes, from 0 on, or of the starts of journeys through
         waypoints; 0 1 2 of the test, and one journey, unless given.
-      waypoints: x and y of each, metres; starts are near the origin. None: the test's targets.
+      waypoints: x and y of each, metres; starts are near the origin. Without any, the test's
+        targets.
       reach: metres; a waypoint is reached when the robot is this near. The test has its own.
       seed: of the test, or of the starts.
       seconds: an episode that is longer ends here.
@@ -44,6 +47,9 @@ def main(
     Raises:
       BadInput: there is no such file, controller or drawing, or nothing to draw with.
     """
+    if len(runs) != 1:
+        raise BadInput(f"a film is of one run, not of {', '.join(map(str, runs)) or 'none'}")
+    (run,) = runs
     paths = out or (Path("runs/video") / f"{run.resolve().parent.name}-{run.resolve().name}.gif",)
     for path in paths:
         video.check(path)

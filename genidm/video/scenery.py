@@ -28,6 +28,8 @@ def scene(drawing: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
       height: pixels.
     """
     spec = drawing.copy()
+    # Else the floor, which nothing collides with, would be left out of what comes from a URDF.
+    spec.compiler.discardvisual = False
     planes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     skies = [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
     for part in (*planes, *spec.lights, *skies):
