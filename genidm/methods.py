@@ -140,7 +140,7 @@ MINITAUR: Methods = (
     dataclasses.replace(HER_DE, agent=SAC(her=HER())),
     dataclasses.replace(GE, agent=_STROLLER),
     dataclasses.replace(LR, agent=_STROLLER),
-    # This gait leans to one side, too.
+    # This gait veers to one side: it is not its own mirror image, either.
     dataclasses.replace(HF, agent=_STROLLER, mirror=False),
 )
 """PPO of 256×256 collects, and learns to go to goals (A.1.2, Table 2)."""
