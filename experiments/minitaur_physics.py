@@ -49,7 +49,8 @@ LOOK = (5, 10, 20, 50, 100, 200, 500)
 SHAKEN = 5
 # Runs of which the shortest is taken.
 REPEATS = 10
-ROUNDS = 5
+# Rounds of which the medians are taken, and robot steps of each.
+ROUNDS, ROUND = 5, 2560
 
 
 @dataclasses.dataclass(frozen=True)
@@ -317,7 +318,7 @@ def vectorised() -> list[dict[str, Any]]:
     with contextlib.ExitStack() as opened:
         kinds = [ours(n) for n in counts]
         kinds += [opened.enter_context(gymnasiums(n)) for n in counts]
-        rounds = [[kind.measured(2560 // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
+        rounds = [[kind.measured(ROUND // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
     return [
         {"what": kind.name, "processes": len(kind.pids), "lanes": kind.lanes}
         | {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
@@ -351,8 +352,10 @@ def gymnasiums(processes: int) -> Iterator[Vectorised]:
     env.reset()
     actions = itertools.cycle(np.tile(gait()[:, None], (1, processes, 1)).astype(np.float32))
     pids = [process.pid for process in env.processes]
-    yield Vectorised("AsyncVectorEnv", processes, pids, lambda: env.step(next(actions)))
-    env.close()
+    try:
+        yield Vectorised("AsyncVectorEnv", processes, pids, lambda: env.step(next(actions)))
+    finally:
+        env.close()
 
 
 # ── print ───────────────────────────────────────────────────────────────────────────────────
