@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from genidm.robots.pool import Pool
+from genidm.robots.pool import MOST_ROWS, Pool, portions
 
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in.py"))]
 
@@ -43,6 +43,13 @@ def workers(pool: Pool) -> list[int]:
 def test_answers_come_in_order(make: Callable[..., Pool], count: int) -> None:
     x = rows(count)
     assert np.array_equal(make().map(x), x.sum(1, keepdims=True))
+
+
+@pytest.mark.parametrize(("count", "workers"), [(0, 4), (1, 4), (128, 4), (512, 1), (7, 16)])
+def test_rows_are_given_out_in_ever_smaller_portions(count: int, workers: int) -> None:
+    sizes = portions(count, workers)
+    assert sum(sizes) == count and sizes == sorted(sizes, reverse=True)
+    assert all(size <= MOST_ROWS for size in sizes) and sizes[-1:] in ([], [1])
 
 
 def test_workers_are_started_once(make: Callable[..., Pool]) -> None:
