@@ -49,9 +49,8 @@ def main(
     if robots < 1:
         raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
-    made: dict[str, Journeys] = {}
+    points, made = np.asarray(waypoints), dict[str, Journeys]()
     for name, (model, _) in models.items():
-        points = np.asarray(waypoints)
         made[name] = follow(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}

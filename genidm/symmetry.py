@@ -204,20 +204,23 @@ class Layout:
         """Length of the last dimension."""
         return sum(f.size for f in self.fields)
 
+    @property
+    def _edges(self) -> np.ndarray:
+        """Where each field but the first begins."""
+        return np.cumsum([f.size for f in self.fields])[:-1]
+
     def _split(self, x: Array) -> list[Array]:
         if x.shape[-1] != self.size:
             raise ValueError(f"expected {self.size} numbers, not {x.shape[-1]}")
-        edges = np.cumsum([f.size for f in self.fields])[:-1]
-        return jnp.split(x, edges, axis=-1)
+        return jnp.split(x, self._edges, axis=-1)
 
     def part(self, x: Array, name: str) -> Array:
         """The field `name` of x `[..., n]`."""
         return dict(zip((f.name for f in self.fields), self._split(x), strict=True))[name]
 
     def unsound(self, x: np.ndarray) -> list[str]:
-        """Names of fields of which x `[..., n]` holds what they cannot be."""
-        edges = np.cumsum([f.size for f in self.fields])[:-1]
-        parts = zip(self.fields, np.split(x, edges, axis=-1), strict=True)
+        """Names of fields of which x `[..., n]` on the host holds what they cannot be."""
+        parts = zip(self.fields, np.split(x, self._edges, axis=-1), strict=True)
         return [f.name for f, part in parts if f.sound is not None and not f.sound(part)]
 
     def turn(self, x: Array, yaw: Array) -> Array:
