@@ -3,15 +3,13 @@
     python -m experiments.minitaur_physics         # minutes; what it says is in docs/physics.md
     python -m experiments.minitaur_physics --lanes 4
 
-Speeds of a single robot are in CPU time. Those of several processes are in wall time, but for
-the time that a process is ready and does not get a core, so other load matters little.
+Speeds of a single robot are in CPU time; those of several processes are
+`experiments.minitaur_processes`'.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import itertools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from experiments.minitaur_processes import processes_table, vectorised
 from experiments.physics import metres, table
 from genidm import devices, files, symmetry
 from genidm.config import environment
@@ -49,8 +48,6 @@ LOOK = (5, 10, 20, 50, 100, 200, 500)
 SHAKEN = 5
 # Runs of which the shortest is taken.
 REPEATS = 10
-# Rounds of which the medians are taken, and robot steps of each.
-ROUNDS, ROUND = 5, 2560
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,99 +262,6 @@ def calls(jobs: Jobs) -> list[dict[str, Any]]:
     ]
 
 
-# ── processes ───────────────────────────────────────────────────────────────────────────────
-
-
-def busy(pids: list[int]) -> np.ndarray:
-    """Seconds that each process has run, or waited for a core: the kernel's schedstat."""
-    stats = [Path(f"/proc/{pid}/schedstat").read_text().split() for pid in pids]
-    return np.array([[int(x) for x in s[:2]] for s in stats]).T / 1e9
-
-
-@dataclasses.dataclass(frozen=True)
-class Vectorised:
-    """Robots that processes step together.
-
-    Attributes:
-      name: of what steps them.
-      lanes: robots.
-      pids: of the processes.
-      step: steps them all once, and waits for it.
-    """
-
-    name: str
-    lanes: int
-    pids: list[int]
-    step: Callable[[], Any]
-
-    def measured(self, repeats: int) -> dict[str, float]:
-        """Steps a second of wall, ms of CPU a step, and the share of wall beside the slowest."""
-        wall = slowest = cpu = 0.0
-        for _ in range(repeats):
-            before, began = busy(self.pids), time.perf_counter()
-            self.step()
-            wall += time.perf_counter() - began
-            spent = busy(self.pids) - before
-            slowest += spent.sum(0).max()
-            cpu += spent[0].sum()
-        steps = self.lanes * repeats
-        return {
-            "steps_per_second": steps / wall,
-            "ms_cpu": 1e3 * cpu / steps,
-            "over_slowest": wall / slowest - 1,
-        }
-
-
-def vectorised() -> list[dict[str, Any]]:
-    """1, 2, 4, … processes: how much faster, and what is lost beside them.
-
-    Medians over rounds in which all take their turns: what the machine does meanwhile is
-    shared by all.
-    """
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= devices.cores()]
-    with contextlib.ExitStack() as opened:
-        kinds = [ours(n) for n in counts]
-        kinds += [opened.enter_context(gymnasiums(n)) for n in counts]
-        rounds = [[kind.measured(ROUND // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
-    return [
-        {"what": kind.name, "processes": len(kind.pids), "lanes": kind.lanes}
-        | {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
-        for kind, rows in zip(kinds, zip(*rounds, strict=True), strict=True)
-    ]
-
-
-def ours(processes: int, lanes: int = 128) -> Vectorised:
-    """Lanes shared by processes."""
-    robot = Minitaur(processes=processes)
-    step = jax.jit(robot.step)
-    state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
-    action = jnp.tile(jnp.asarray(gait()[0], jnp.float32), (lanes, 1))
-
-    def once() -> None:
-        step(state, action).position.block_until_ready()
-
-    once()
-    pids = [w.process.pid for w in robot._pool._idle.queue if w]
-    return Vectorised("Minitaur", lanes, pids, once)
-
-
-@contextlib.contextmanager
-def gymnasiums(processes: int) -> Iterator[Vectorised]:
-    """gymnasium's AsyncVectorEnv, an environment a process."""
-    from gymnasium.vector import AsyncVectorEnv
-
-    from genidm.robots.minitaur_env import MinitaurEnv
-
-    env = AsyncVectorEnv([MinitaurEnv] * processes, context="forkserver")
-    env.reset()
-    actions = itertools.cycle(np.tile(gait()[:, None], (1, processes, 1)).astype(np.float32))
-    pids = [process.pid for process in env.processes]
-    try:
-        yield Vectorised("AsyncVectorEnv", processes, pids, lambda: env.step(next(actions)))
-    finally:
-        env.close()
-
-
 # ── print ───────────────────────────────────────────────────────────────────────────────────
 
 
@@ -390,21 +294,6 @@ def calls_table(rows: list[dict[str, Any]]) -> str:
     return table(["self-collision", "batched calls", "ms CPU a step"], lines)
 
 
-def processes_table(rows: list[dict[str, Any]]) -> str:
-    """Speed, its ratio to one process, and overhead."""
-    one = {r["what"]: r["steps_per_second"] for r in rows if r["processes"] == 1}
-    lines = [
-        [
-            r["what"], str(r["processes"]), str(r["lanes"]), f"{r['steps_per_second']:.0f}",
-            f"{r['steps_per_second'] / one[r['what']]:.2f}", f"{r['ms_cpu']:.2f}",
-            f"{100 * r['over_slowest']:.0f} %",
-        ]
-        for r in rows
-    ]  # fmt: skip
-    head = ["what", "processes", "lanes", "steps/s", "ratio", "ms CPU a step", "over the slowest"]
-    return table(head, lines)
-
-
 def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None:
     """Measures, prints the tables and writes the JSON."""
     options.check()
@@ -413,7 +302,7 @@ def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Optio
     results = dict[str, Any]()
     with Jobs() as jobs:
         for name, rows, show in (
-            ("processes", vectorised, processes_table),
+            ("processes", lambda: vectorised(gait()), processes_table),
             ("calls", lambda: calls(jobs), calls_table),
             ("fidelity", lambda: fidelity(jobs, options), fidelity_table),
             ("drift", lambda: drift(jobs, options), drift_table),

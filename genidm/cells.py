@@ -28,8 +28,10 @@ from genidm.episodes import Episodes
 from genidm.evaluate import Steering, Test, episodes, flatten, run
 from genidm.experience import Experience
 from genidm.fit import Fit, fit
-from genidm.generalize import Replay, pairs, replay, residual
+from genidm.generalize import replay, residual
 from genidm.methods import Direct, Inverse, Method
+from genidm.pairs import pairs
+from genidm.replaying import Replay
 from genidm.robots import Robot
 from genidm.scale import Scale
 from genidm.scenarios import Scenarios, tours

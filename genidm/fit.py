@@ -14,8 +14,8 @@ import optax
 from genidm import devices
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
-from genidm.generalize import Pairs
 from genidm.models import Architecture
+from genidm.pairs import Pairs
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot
 from genidm.store import Stage

@@ -16,7 +16,7 @@ from genidm.errors import BadInput
 from genidm.evaluate import Test, Testing, flatten
 from genidm.experiment import Options, cell
 from genidm.fit import Fit, fit
-from genidm.generalize import Pairs
+from genidm.pairs import Pairs
 from genidm.robots import Humanoid
 from genidm.scenarios import scenarios
 from genidm.tasks import WalkForward

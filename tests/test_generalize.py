@@ -17,15 +17,9 @@ from genidm.collect import collect
 from genidm.controller import in_frame
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
-from genidm.generalize import (
-    Generalize,
-    Replay,
-    generalize,
-    pairs,
-    replay,
-    residual,
-    with_reflection,
-)
+from genidm.generalize import Generalize, generalize, replay, residual
+from genidm.pairs import pairs, with_reflection
+from genidm.replaying import Replay
 from genidm.robots import Ant
 from genidm.tasks import WalkForward
 

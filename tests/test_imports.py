@@ -36,6 +36,8 @@ agents.*
 agents.frozen
 agents
 collect
+replaying
+pairs
 generalize
 models
 controller

@@ -12,8 +12,8 @@ from point import Point, Straight
 from genidm.controller import Controller
 from genidm.experience import Experience
 from genidm.fit import Fit, training
-from genidm.generalize import Pairs
 from genidm.invariance import ANGLES, invariance, probes
+from genidm.pairs import Pairs
 from genidm.robots import Ant, Robot
 
 

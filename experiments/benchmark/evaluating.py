@@ -12,8 +12,9 @@ from experiments.benchmark.measuring import Probe, carried, timed
 from genidm.controller import load
 from genidm.evaluate import Queue, Steering, Test, Testing, evaluate, flatten
 from genidm.fit import fit
-from genidm.generalize import pairs, rotate
+from genidm.generalize import rotate
 from genidm.methods import LR
+from genidm.pairs import pairs
 from genidm.progress import METRICS, read_metrics
 from genidm.scenarios import Scenarios, scenarios
 from genidm.store import Stage

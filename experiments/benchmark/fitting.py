@@ -15,7 +15,7 @@ import numpy as np
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, carried, timed
 from genidm.fit import Fit, training
-from genidm.generalize import Pairs
+from genidm.pairs import Pairs
 from genidm.robots import Robot
 
 Shape = tuple[int, int]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
@@ -10,9 +9,9 @@ import jax
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.collecting import record
 from experiments.benchmark.measuring import Probe, carried, timed
-from genidm.generalize import Blocks, Runner
 from genidm.methods import LR
 from genidm.progress import Progress
+from genidm.replaying import Blocks, Runner
 
 
 def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
@@ -23,8 +22,8 @@ def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
       program_alone: leave out the sending and bringing back.
     """
     assert LR.generalize
-    settings = dataclasses.replace(LR.generalize, lanes=bench.options.wide)
-    blocks = Blocks(bench.once(record), settings, bench.mesh.size)
+    segment, lanes = LR.generalize.segment, bench.options.wide
+    blocks = Blocks(bench.once(record), segment, lanes, bench.mesh.size)
     key = jax.random.key(0)
     keys, block = blocks.example(key)
     runner = Runner(bench.robot, bench.mesh, (keys, block))

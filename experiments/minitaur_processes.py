@@ -1,0 +1,134 @@
+"""Minitaurs stepped by several processes: how much faster, and what is lost beside the slowest.
+
+Rows of `experiments.minitaur_physics`. In wall time, but for the time that a process is ready
+and does not get a core, so other load matters little.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.physics import table
+from genidm import devices
+from genidm.robots import Minitaur
+
+# Rounds of which the medians are taken, and robot steps of each.
+ROUNDS, ROUND = 5, 2560
+
+
+def busy(pids: list[int]) -> np.ndarray:
+    """Seconds that each process has run, or waited for a core: the kernel's schedstat."""
+    stats = [Path(f"/proc/{pid}/schedstat").read_text().split() for pid in pids]
+    return np.array([[int(x) for x in s[:2]] for s in stats]).T / 1e9
+
+
+@dataclasses.dataclass(frozen=True)
+class Vectorised:
+    """Robots that processes step together.
+
+    Attributes:
+      name: of what steps them.
+      lanes: robots.
+      pids: of the processes.
+      step: steps them all once, and waits for it.
+    """
+
+    name: str
+    lanes: int
+    pids: list[int]
+    step: Callable[[], Any]
+
+    def measured(self, repeats: int) -> dict[str, float]:
+        """Steps a second of wall, ms of CPU a step, and the share of wall beside the slowest."""
+        wall = slowest = cpu = 0.0
+        for _ in range(repeats):
+            before, began = busy(self.pids), time.perf_counter()
+            self.step()
+            wall += time.perf_counter() - began
+            spent = busy(self.pids) - before
+            slowest += spent.sum(0).max()
+            cpu += spent[0].sum()
+        steps = self.lanes * repeats
+        return {
+            "steps_per_second": steps / wall,
+            "ms_cpu": 1e3 * cpu / steps,
+            "over_slowest": wall / slowest - 1,
+        }
+
+
+def vectorised(actions: np.ndarray) -> list[dict[str, Any]]:
+    """A row for 1, 2, 4, … processes, ours and gymnasium's.
+
+    Medians over rounds in which all take their turns: what the machine does meanwhile is
+    shared by all.
+
+    Args:
+      actions: `[T, 8]`, of robots that walk.
+    """
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= devices.cores()]
+    with contextlib.ExitStack() as opened:
+        kinds = [ours(n, actions) for n in counts]
+        kinds += [opened.enter_context(gymnasiums(n, actions)) for n in counts]
+        rounds = [[kind.measured(ROUND // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
+    return [
+        {"what": kind.name, "processes": len(kind.pids), "lanes": kind.lanes}
+        | {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
+        for kind, rows in zip(kinds, zip(*rounds, strict=True), strict=True)
+    ]
+
+
+def ours(processes: int, actions: np.ndarray, lanes: int = 128) -> Vectorised:
+    """Lanes shared by processes."""
+    robot = Minitaur(processes=processes)
+    step = jax.jit(robot.step)
+    state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
+    action = jnp.tile(jnp.asarray(actions[0], jnp.float32), (lanes, 1))
+
+    def once() -> None:
+        step(state, action).position.block_until_ready()
+
+    once()
+    pids = [w.process.pid for w in robot._pool._idle.queue if w]
+    return Vectorised("Minitaur", lanes, pids, once)
+
+
+@contextlib.contextmanager
+def gymnasiums(processes: int, actions: np.ndarray) -> Iterator[Vectorised]:
+    """gymnasium's AsyncVectorEnv, an environment a process."""
+    from gymnasium.vector import AsyncVectorEnv
+
+    from genidm.robots.minitaur_env import MinitaurEnv
+
+    env = AsyncVectorEnv([MinitaurEnv] * processes, context="forkserver")
+    env.reset()
+    commands = itertools.cycle(np.tile(actions[:, None], (1, processes, 1)).astype(np.float32))
+    pids = [process.pid for process in env.processes]
+    try:
+        yield Vectorised("AsyncVectorEnv", processes, pids, lambda: env.step(next(commands)))
+    finally:
+        env.close()
+
+
+def processes_table(rows: list[dict[str, Any]]) -> str:
+    """Speed, its ratio to one process, and overhead."""
+    one = {r["what"]: r["steps_per_second"] for r in rows if r["processes"] == 1}
+    lines = [
+        [
+            r["what"], str(r["processes"]), str(r["lanes"]), f"{r['steps_per_second']:.0f}",
+            f"{r['steps_per_second'] / one[r['what']]:.2f}", f"{r['ms_cpu']:.2f}",
+            f"{100 * r['over_slowest']:.0f} %",
+        ]
+        for r in rows
+    ]  # fmt: skip
+    head = ["what", "processes", "lanes", "steps/s", "ratio", "ms CPU a step", "over the slowest"]
+    return table(head, lines)

@@ -1,0 +1,215 @@
+"""A record's actions replayed from turned starts (𝒢, Def. 4): its blocks, and their program."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from genidm import devices, files
+from genidm.experience import Experience
+from genidm.progress import Progress, compiled
+from genidm.robots.base import Robot, State, select
+
+
+class Replay(flax.struct.PyTreeNode):
+    """What 𝒢 saw: C turned copies of a record of T steps of B lanes.
+
+    Attributes:
+      s: ŝ `[C, T, B, S]`.
+      o: ô `[C, T, B, 3]`.
+      o_next: `[C, T, B, 3]`, replayed position after the step.
+      yaw: `[C, T, B]`, radians, by which the step is turned.
+      start: `[T, B]` int32, the step at which the robot was last placed.
+      valid: `[C, T, B]` bool, False once the physics diverged.
+    """
+
+    s: Any
+    o: Any
+    o_next: Any
+    yaw: Any
+    start: Any
+    valid: Any
+
+    def save(self, path: Path) -> None:
+        """Writes the replay as a directory of arrays, without pickle."""
+        tree = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        files.save_arrays(path, tree, {}, overwrite=True)
+
+    @classmethod
+    def load(cls, path: Path) -> Replay:
+        """A replay that `save` wrote; raises BadInput if it is torn."""
+        return cls(**files.load_arrays(path)[0])
+
+
+Block = dict[str, Any]
+
+
+class Blocks:
+    """A record cut into blocks `[H, lanes]` of equal size, and put together again.
+
+    Each column of a block is a segment, and blocks are independent; or, where whole episodes
+    are replayed, the columns are the record's lanes, and blocks follow one another.
+    Iterating gives the blocks, trees of arrays on the host.
+
+    Args:
+      experience: E, `[T, B, ...]`, with its physics.
+      length: steps of a block, H.
+      lanes: segments replayed at once; an accelerator takes more.
+      among: devices that share a block's lanes evenly.
+      follow: replay whole episodes.
+
+    Attributes:
+      placed: `[T, B]` bool, where the robot is placed on the record.
+      start: `[T, B]` int32, for each step that of the last placement.
+      length: steps of a block, H.
+      width: lanes of a block.
+      follow: whether blocks follow one another.
+    """
+
+    def __init__(
+        self, experience: Experience, length: int, lanes: int, among: int, *, follow: bool = False
+    ):
+        first = np.asarray(experience.first)
+        self.steps, recorded = first.shape
+        self.length, self.follow = length, follow
+        time = np.arange(self.steps, dtype=np.int32)[:, None]
+        self.placed = first | (time % (self.steps if follow else length) == 0)
+        self.start = np.maximum.accumulate(np.where(self.placed, time, 0), axis=0)
+        self.shape = (-(-self.steps // length), recorded)
+        width = recorded if follow else min(devices.at_once(lanes), self.shape[0] * recorded)
+        self.width = -(-width // among) * among
+        source = dict(
+            physics=experience.physics, s=experience.s, a=experience.a,
+            placed=self.placed, valid=experience.valid,
+        )  # fmt: skip
+        self.columns = jax.tree.map(lambda x: self._cut(np.asarray(x)), source)
+
+    def _cut(self, x: np.ndarray) -> np.ndarray:
+        """`[T, B, ...]` → `[H, blocks in time × B, ...]`, the last block padded."""
+        pad = self.shape[0] * self.length - self.steps
+        x = np.concatenate([x, x[-1:].repeat(pad, axis=0)]) if pad else x
+        x = x.reshape(self.shape[0], self.length, *x.shape[1:]).swapaxes(0, 1)
+        return x.reshape(self.length, -1, *x.shape[3:])
+
+    def __iter__(self) -> Iterator[Block]:
+        step = self.shape[1] if self.follow else self.width
+        for begin in range(0, self.shape[0] * self.shape[1], step):
+            yield jax.tree.map(functools.partial(self._pad, begin, begin + step), self.columns)
+
+    def _pad(self, begin: int, end: int, columns: np.ndarray) -> np.ndarray:
+        x = columns[:, begin:end]
+        short = self.width - x.shape[1]
+        return np.concatenate([x, x[:, -1:].repeat(short, axis=1)], axis=1) if short else x
+
+    @property
+    def total(self) -> int:
+        """Steps in all blocks, the padding counted."""
+        step = self.shape[1] if self.follow else self.width
+        return -(-self.shape[0] * self.shape[1] // step) * self.length * self.width
+
+    def example(self, key: jax.Array) -> tuple[jax.Array, Block]:
+        """Arguments of the first call, to compile for."""
+        return jax.random.split(key, self.width), next(iter(self))
+
+    def gather(self, outputs: list[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
+        """Outputs of all blocks as arrays `[T, B, ...]`."""
+        step = self.shape[1] if self.follow else self.width
+
+        def join(*parts: np.ndarray) -> np.ndarray:
+            x = np.concatenate([p[:, :step] for p in parts], axis=1)
+            x = x[:, : self.shape[0] * self.shape[1]]
+            x = x.reshape(self.length, *self.shape, *x.shape[2:]).swapaxes(0, 1)
+            return x.reshape(-1, *x.shape[2:])[: self.steps]
+
+        return [join(*parts) for parts in zip(*outputs, strict=True)]
+
+
+class Cursor(flax.struct.PyTreeNode):
+    """Robots in the middle of a replay, and the yaw that each is turned by."""
+
+    robots: State
+    yaw: jax.Array
+    valid: jax.Array
+    keys: jax.Array
+
+
+class Runner:
+    """The compiled replay of one block, its lanes sharded over the mesh.
+
+    Args:
+      robot: whose record is replayed.
+      mesh: devices that share the lanes.
+      example: keys and a block of the shapes to compile for (`Blocks.example`).
+
+    Attributes:
+      program: the compiled (cursor, block on the devices) → (cursor, outputs on the
+        devices): s, o, o', yaw and valid, `[H, lanes, ...]`.
+    """
+
+    def __init__(self, robot: Robot, mesh: Mesh, example: tuple[jax.Array, Block]):
+        self.robot, self.mesh = robot, mesh
+        keys, block = example
+        cursor = self.start(keys, block)
+        sharded = devices.over_lanes(self._replay, mesh, [0, 1], (0, 1))
+        self.program = compiled("generalize", jax.jit(sharded), cursor, self.put(block))
+
+    def put(self, block: Block) -> Block:
+        """A block on the devices."""
+        return devices.put(block, self.mesh, axis=1)
+
+    def start(self, keys: jax.Array, block: Block) -> Cursor:
+        """A cursor for a block, with keys `[lanes]`; its robots are placed before they step."""
+        yaw = jnp.zeros(keys.shape)
+        first = jax.tree.map(lambda x: x[0], block["physics"])
+        shapes = jax.eval_shape(self.robot.place, first, yaw)
+        robots = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return devices.put(Cursor(robots, yaw, yaw == 0, keys), self.mesh)
+
+    def over(self, blocks: Blocks, key: jax.Array, bar: Progress) -> list[tuple[np.ndarray, ...]]:
+        """Outputs of all blocks, on the host; where blocks follow one another, robots go on."""
+        outputs: list[tuple[np.ndarray, ...]] = []
+        cursor = None
+        for i, block in enumerate(blocks):
+            if cursor is None or not blocks.follow:
+                # A column's key is its own, however wide the blocks are.
+                columns = i * blocks.width + np.arange(blocks.width)
+                keys = jax.vmap(jax.random.fold_in, (None, 0))(key, columns)
+                cursor = self.start(keys, block)
+            cursor, out = self.program(cursor, self.put(block))
+            outputs.append(jax.tree.map(np.asarray, out))
+            bar.advance(blocks.length * blocks.width)
+        return outputs
+
+    def _replay(self, cursor: Cursor, block: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
+        return jax.lax.scan(self._step, cursor, block)
+
+    def _step(self, cursor: Cursor, row: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
+        """One step of B lanes: placed on the record where it says so, then replayed."""
+        placed = row["placed"]
+        keys, yaw = _draw_yaw(cursor.keys)
+        yaw = jnp.where(placed, yaw, cursor.yaw)
+        on_record = self.robot.place(row["physics"], yaw)
+        # The record knows readings that `place` cannot (contact): turned, they are exact.
+        on_record = on_record.replace(observation=self.robot.observation.turn(row["s"], yaw))
+        before = select(placed, on_record, cursor.robots)
+        after = self.robot.step(before, row["a"])
+        valid = (placed | cursor.valid) & row["valid"] & ~after.diverged
+        out = (before.observation, before.position, after.position, yaw, valid)
+        return Cursor(after, yaw, valid, keys), out
+
+
+def _draw_yaw(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    streams = jax.vmap(jax.random.split)(keys)
+    draw: Callable[[jax.Array], jax.Array] = jax.vmap(
+        lambda k: jax.random.uniform(k, minval=-jnp.pi, maxval=jnp.pi)
+    )
+    return streams[:, 0], draw(streams[:, 1])
