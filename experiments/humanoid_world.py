@@ -8,7 +8,7 @@ the same walks, the same actions, the same 𝒢, another s.
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,11 +41,14 @@ def record(options: table1.Table) -> Experience:
     source, target = (cell(robot, lr, options) for robot in (Humanoid(), HumanoidWorld()))
     assert isinstance(source, InverseCell) and isinstance(target, InverseCell)
     stage = target.experience_stage
-    if not stage.done:
+
+    def work() -> dict[str, Any]:
         seen = source.experience()
         seen = seen.replace(s=in_world(seen.s))
         seen.save(stage.path("experience") / "chunk_00000")
-        stage.finish(source.experience_stage.summary())
+        return source.experience_stage.summary()
+
+    stage.once(work)
     return target.experience()
 
 

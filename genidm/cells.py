@@ -103,21 +103,22 @@ class Cell(abc.ABC, Generic[M]):
         """
         config = dict(fit=self.controller_stage.directory.name, bank=bank.digest(), test=self.test)
         stage = Stage.open(self.root, f"{kind}-{self._label}", config)
-        if not stage.done:
-            model, walks = self.controller(), tours(self.robot)
-            outcome, ways = run(
-                self.robot, model, flatten(walks, bank), self.test,
-                traced=walks.yaw.size, stage=stage,
-            )  # fmt: skip
-            rest = jax.tree.map(lambda x: np.asarray(x)[walks.yaw.size :], outcome)
-            save_test(stage, episodes(rest, bank.shape), ways)
-            stage.finish(
-                self.controller_stage.summary()
-                | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
-                | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
-            )
-            stage.clear_checkpoints()
+        stage.once(lambda: self._tested(stage, bank))
         return stage
+
+    def _tested(self, stage: Stage, bank: Scenarios) -> dict[str, Any]:
+        model, walks = self.controller(), tours(self.robot)
+        outcome, ways = run(
+            self.robot, model, flatten(walks, bank), self.test,
+            traced=walks.yaw.size, stage=stage,
+        )  # fmt: skip
+        rest = jax.tree.map(lambda x: np.asarray(x)[walks.yaw.size :], outcome)
+        save_test(stage, episodes(rest, bank.shape), ways)
+        return (
+            self.controller_stage.summary()
+            | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
+            | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,14 +141,15 @@ class InverseCell(Cell[Inverse]):
     def experience(self) -> Experience:
         """What the agent saw while it learned (§4.1)."""
         stage = self.experience_stage
-        if not stage.done:
-            agent, before = self._collector()
-            record, policy = self._collect(stage, agent, self.scale.interactions - before)
-            if policy:
-                policy.save(stage.path("policy"), overwrite=True)
-            stage.finish({"interactions": before + record.interactions})
-            return record
+        stage.once(self._collected)
         return experience.load_chunks(stage.path("experience"), self.robot)
+
+    def _collected(self) -> dict[str, Any]:
+        stage, (agent, before) = self.experience_stage, self._collector()
+        record, policy = self._collect(stage, agent, self.scale.interactions - before)
+        if policy:
+            policy.save(stage.path("policy"), overwrite=True)
+        return {"interactions": before + record.interactions}
 
     def _collector(self) -> tuple[Agent, int]:
         """What collects, and for how many interactions it has learned before."""
@@ -157,12 +159,14 @@ class InverseCell(Cell[Inverse]):
         interactions = whole(frozen.agent, round(frozen.share * self.scale.interactions))
         config = self._learning(frozen.agent, interactions)
         stage = Stage.open(self.root, f"agent-{type(frozen.agent).__name__}-{self.seed}", config)
-        if not stage.done:
+
+        def work() -> dict[str, Any]:
             _, policy = self._collect(stage, frozen.agent, interactions, keep=False)
             assert policy  # both agents that can be frozen have one
             policy.save(stage.path("policy"), overwrite=True)
-            stage.finish({"interactions": interactions})
-            stage.clear_checkpoints()
+            return {"interactions": interactions}
+
+        stage.once(work)
         learned = controller.load(stage.path("policy"), self.robot)
         assert isinstance(learned, Policy)
         return Acting(frozen.agent, learned), interactions
@@ -183,11 +187,14 @@ class InverseCell(Cell[Inverse]):
         stage = self.replay_stage
         if stage is None:
             return None
-        if not stage.done:
+
+        def work() -> dict[str, Any]:
             turned = replay(self.robot, record, self._key(1), self.method.generalize)
             turned.save(stage.path("replay"))
             files.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
-            stage.finish({"replayed": turned.yaw.size})
+            return {"replayed": turned.yaw.size}
+
+        stage.once(work)
         return Replay.load(stage.path("replay"))
 
     @functools.cached_property
@@ -216,27 +223,27 @@ class InverseCell(Cell[Inverse]):
 
     def controller(self) -> Steering:
         """The fitted models."""
-        stage, m = self.controller_stage, self.method
-        if not stage.done:
-            record = self.experience().first_share(m.share)
-            samples = pairs(
-                self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
-            )
-            model = fit(self.robot, samples, self._fit_key, self._fit, frame=m.frame, stage=stage)
-            model.save(stage.path("controller"), overwrite=True)
-            stage.finish(
-                {
-                    "robot": self.robot.name,
-                    "method": m.name,
-                    "experience": self.experience_stage.directory.name,
-                    "interactions": self._count(self.experience_stage, "interactions"),
-                    "learned_from": record.interactions,
-                    "replayed": self._count(self.replay_stage, "replayed"),
-                    "settings": plain(dataclasses.replace(m, fit=self._fit)),
-                }
-            )
-            stage.clear_checkpoints()
+        stage = self.controller_stage
+        stage.once(self._fitted)
         return controller.load(stage.path("controller"), self.robot)
+
+    def _fitted(self) -> dict[str, Any]:
+        stage, m = self.controller_stage, self.method
+        record = self.experience().first_share(m.share)
+        samples = pairs(
+            self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
+        )
+        model = fit(self.robot, samples, self._fit_key, self._fit, frame=m.frame, stage=stage)
+        model.save(stage.path("controller"), overwrite=True)
+        return {
+            "robot": self.robot.name,
+            "method": m.name,
+            "experience": self.experience_stage.directory.name,
+            "interactions": self._count(self.experience_stage, "interactions"),
+            "learned_from": record.interactions,
+            "replayed": self._count(self.replay_stage, "replayed"),
+            "settings": plain(dataclasses.replace(m, fit=self._fit)),
+        }
 
     def _count(self, stage: Stage | None, what: str) -> int:
         return stage.summary()[what] if stage else 0
@@ -253,24 +260,24 @@ class DirectCell(Cell[Direct]):
 
     def controller(self) -> Steering:
         """The policy that the agent ended with."""
-        stage, m = self.controller_stage, self.method
-        if not stage.done:
-            _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
-            assert policy  # no Direct method has an agent that learns nothing
-            policy.save(stage.path("controller"), overwrite=True)
-            interactions = whole(m.agent, self.scale.interactions)
-            stage.finish(
-                {
-                    "robot": self.robot.name,
-                    "method": m.name,
-                    "interactions": interactions,
-                    "learned_from": interactions,
-                    "replayed": 0,
-                    "settings": plain(m),
-                }
-            )
-            stage.clear_checkpoints()
+        stage = self.controller_stage
+        stage.once(self._learned)
         return controller.load(stage.path("controller"), self.robot)
+
+    def _learned(self) -> dict[str, Any]:
+        stage, m = self.controller_stage, self.method
+        _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
+        assert policy  # no Direct method has an agent that learns nothing
+        policy.save(stage.path("controller"), overwrite=True)
+        interactions = whole(m.agent, self.scale.interactions)
+        return {
+            "robot": self.robot.name,
+            "method": m.name,
+            "interactions": interactions,
+            "learned_from": interactions,
+            "replayed": 0,
+            "settings": plain(m),
+        }
 
 
 def save_test(stage: Stage, outcome: Episodes, ways: list[np.ndarray]) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
+import os
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +60,19 @@ class Stage:
         except Torn as torn:
             raise Torn(f"{self.directory} is not the directory of a finished run: {torn}") from None
 
+    def once(self, work: Callable[[], dict[str, Any]]) -> None:
+        """Does the stage, unless it is done; `work` returns its summary.
+
+        Where several processes come to one stage, one does it and the others wait. One that
+        dies gives the stage free, however it dies.
+        """
+        if self.done:
+            return
+        with _alone(self.directory):
+            if not self.done:
+                self.finish(work())
+                self.clear_checkpoints()
+
     def finish(self, summary: dict[str, Any]) -> None:
         """Marks the stage as finished; the last thing done to it."""
         save_json(self.path("done.json"), summary)
@@ -72,3 +89,19 @@ class Stage:
         """Removes them."""
         with disk(self.directory):
             remove(self.path("checkpoints"))
+
+
+@contextlib.contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Holds the lock of a directory; goes without where the file system has none."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(f"waiting for another process, at work in {directory}", file=sys.stderr)
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

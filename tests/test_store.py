@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 from bits import truncate
 from test_config import Config, Other
 
@@ -51,3 +58,79 @@ def test_a_stage_resumed_elsewhere_warns(tmp_path: Path, monkeypatch, capfd) -> 
     stage.finish({})
     Stage.open(tmp_path, "fit", {})
     assert "warning" not in capfd.readouterr().err
+
+
+def test_work_is_done_once_and_its_checkpoints_go(tmp_path: Path) -> None:
+    stage, calls = Stage.open(tmp_path, "fit", {}), []
+
+    def work() -> dict[str, int]:
+        stage.checkpoints().save(1, {"a": 1})
+        calls.append(stage.done)
+        return {"n": 7}
+
+    stage.once(work)
+    stage.once(work)
+    assert calls == [False] and stage.summary() == {"n": 7}
+    assert stage.checkpoints().steps() == []
+
+
+def test_work_that_fails_is_not_done_and_can_be_done_again(tmp_path: Path) -> None:
+    stage = Stage.open(tmp_path, "fit", {})
+    with pytest.raises(ZeroDivisionError):
+        stage.once(lambda: {"n": 1 // 0})
+    assert not stage.done
+    stage.once(lambda: {"n": 1})
+    assert stage.done
+
+
+HOLDS = """
+import sys, time
+from genidm.store import Stage
+def work():
+    print("at work", flush=True)
+    sys.stdin.readline()
+    return {"by": "the other"}
+Stage.open(sys.argv[1], "fit", {}).once(work)
+"""
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[subprocess.Popen]:
+    """A process in the middle of a stage; it ends the stage when it is told a line."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout and process.stdout.readline() == b"at work\n"
+        yield process
+        process.kill()
+
+
+def test_a_stage_that_another_process_does_is_waited_for(tmp_path: Path, other, capfd) -> None:
+    stage, calls = Stage.open(tmp_path, "fit", {}), []
+    waiting = threading.Thread(target=stage.once, args=[lambda: calls.append(1) or {}])
+    waiting.start()
+    waiting.join(1)
+    assert waiting.is_alive() and not calls
+    assert f"waiting for another process, at work in {stage.directory}" in capfd.readouterr().err
+    other.communicate(b"end\n")
+    waiting.join(20)
+    assert not waiting.is_alive() and not calls
+    assert stage.summary() == {"by": "the other"}
+
+
+def test_a_stage_whose_process_was_killed_is_free(tmp_path: Path, other) -> None:
+    stage = Stage.open(tmp_path, "fit", {})
+    other.kill()
+    other.wait()
+    stage.once(lambda: {"by": "this"})
+    assert stage.summary() == {"by": "this"}
+
+
+def test_without_locks_work_is_done_all_the_same(tmp_path: Path, monkeypatch) -> None:
+    def none(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks here")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    stage = Stage.open(tmp_path, "fit", {})
+    stage.once(lambda: {"n": 1})
+    assert stage.done
