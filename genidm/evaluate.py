@@ -38,7 +38,7 @@ class Test:
     Attributes:
       max_steps: an episode ends after this many steps (A.1.3: 1000).
       reach: metres; an episode ends when the target is this near.
-      lanes: robots at once, over all devices; an accelerator takes more.
+      lanes: robots at once, over all devices; see `Robot.at_once`.
       chunk: steps a program call.
     """
 
@@ -167,8 +167,9 @@ def run(
     """
     testing = Testing(robot, bank, settings or Test(), mesh or devices.mesh(), traced)
     queue, calls = testing.start(), 0
-    # Its queues belong to the devices: with another number of them the test begins anew.
-    checkpoints = stage.checkpoints(f"{testing.mesh.size}_devices") if stage else None
+    # Its queues belong to the devices: on others the test begins anew.
+    here = f"{testing.mesh.size}_devices_{queue.episode.size}_lanes"
+    checkpoints = stage.checkpoints(here) if stage else None
     found = checkpoints.latest(queue) if checkpoints else None
     if found:
         calls, queue = found[0], devices.put(found[1], testing.mesh)
@@ -233,7 +234,7 @@ class Testing:
     def start(self) -> Queue:
         """Queues whose lanes are all idle, on the devices."""
         count, share = self.mesh.size, self.share
-        lanes = count * min(-(-devices.at_once(self.settings.lanes) // count), share)
+        lanes = count * min(-(-self.robot.at_once(self.settings.lanes) // count), share)
         # One a device at least: jax forgets how an array without elements is shared out.
         rows = count * max(1, -(-self.traced // count))
         shapes = jax.eval_shape(

@@ -37,7 +37,7 @@ class Generalize:
         exactly, without physics.
       segment: steps of a segment, H.
       copies: turned copies of the record.
-      lanes: robots replayed at once; an accelerator takes more.
+      lanes: robots replayed at once; see `Robot.at_once`.
     """
 
     mode: Mode = "segments"
@@ -80,7 +80,8 @@ def replay(
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
     mesh = mesh or devices.mesh()
     follow = settings.mode == "episodes"
-    blocks = Blocks(experience, settings.segment, settings.lanes, mesh.size, follow=follow)
+    lanes = robot.at_once(settings.lanes)
+    blocks = Blocks(experience, settings.segment, lanes, mesh.size, follow=follow)
     runner = Runner(robot, mesh, blocks.example(key))
     copies = []
     with Progress("generalize", settings.copies * blocks.total, "steps", quiet=quiet) as bar:

@@ -63,7 +63,7 @@ class Blocks:
     Args:
       experience: E, `[T, B, ...]`, with its physics.
       length: steps of a block, H.
-      lanes: segments replayed at once; an accelerator takes more.
+      lanes: segments replayed at once.
       among: devices that share a block's lanes evenly.
       follow: replay whole episodes.
 
@@ -85,7 +85,7 @@ class Blocks:
         self.placed = first | (time % (self.steps if follow else length) == 0)
         self.start = np.maximum.accumulate(np.where(self.placed, time, 0), axis=0)
         self.shape = (-(-self.steps // length), recorded)
-        width = recorded if follow else min(devices.at_once(lanes), self.shape[0] * recorded)
+        width = recorded if follow else min(lanes, self.shape[0] * recorded)
         self.width = -(-width // among) * among
         source = dict(
             physics=experience.physics, s=experience.s, a=experience.a,

@@ -161,9 +161,11 @@ def test_one_lane_wastes_no_step(tmp_path: Path) -> None:
     assert last["step"] == SEEDS * EPISODES
 
 
-@pytest.mark.parametrize("cores", [2, 1])
-def test_a_killed_test_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch, cores: int) -> None:
-    """With another number of devices it begins anew, as its queues belong to the devices."""
+@pytest.mark.parametrize(("cores", "lanes"), [(2, 8), (1, 8), (2, 6)])
+def test_a_killed_test_goes_on_to_the_same_bits(
+    tmp_path: Path, monkeypatch, cores: int, lanes: int
+) -> None:
+    """On other devices it begins anew: its queues belong to them, and lanes go by their memory."""
     robot, stage = Point(falls_at=4.0), Stage.open(tmp_path, "test", {})
     whole = steer(robot, lanes=8)
     monkeypatch.setattr(checkpoints, "CHECKPOINT_SECONDS", 0)
@@ -174,14 +176,15 @@ def test_a_killed_test_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch, cor
     calls = []
     count = Progress.advance
     monkeypatch.setattr(Progress, "advance", lambda *a, **k: (calls.append(a), count(*a, **k)))
-    resumed = steer(robot, lanes=8, stage=stage, mesh=devices.mesh(jax.devices()[:cores]))
-    if cores == 2:
+    resumed = steer(robot, lanes=lanes, stage=stage, mesh=devices.mesh(jax.devices()[:cores]))
+    goes_on = (cores, lanes) == (2, 8)
+    if goes_on:
         for x, y in zip(dataclasses.astuple(whole), dataclasses.astuple(resumed), strict=True):
             np.testing.assert_array_equal(x, y)
     agree(resumed, closed_form(robot, 1.0)[0])
     steps = [line["step"] for line in read_metrics(stage.path(METRICS))]
     assert steps == sorted(steps) and steps[-1] == SEEDS * EPISODES
-    assert len(calls) == len(steps) - 2 * (cores == 2)
+    assert len(calls) == len(steps) - 2 * goes_on
 
 
 @pytest.mark.parametrize("wrong", [{"lanes": 0}, {"max_steps": 0}, {"chunk": 0}, {"reach": -0.1}])

@@ -21,9 +21,11 @@ from original_minitaur import AFTER, RECORD, actions, original
 
 from genidm import devices, symmetry
 from genidm.errors import BadInput
+from genidm.evaluate import Test, Testing, flatten
 from genidm.robots import Minitaur, State, by_name
 from genidm.robots.bullet import ALOFT, HOT, PATIENT, WIDTH, Engine, Simulation, parts, stepped
 from genidm.robots.minitaur import Physics, from_rows
+from genidm.scenarios import scenarios
 from genidm.tasks import WalkForward
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no wheel of it here")
@@ -290,6 +292,14 @@ def test_reward_is_that_of_pybullet_envs_a_second(minitaur: Minitaur) -> None:
     assert not step.terminal.any() and energy.max() > 1e-3
     expected = (forward - 0.005 * energy) / 0.01 + minitaur.alive_bonus
     assert_near(step.reward, expected, 1e-4)
+
+
+def test_processes_are_kept_busy_and_no_more(minitaur: Minitaur) -> None:
+    """A robot whose episode is over costs a step, too: who asks for 512 gets 32 a process."""
+    bank = flatten(scenarios(minitaur, seeds=1, episodes=600))
+    queue = Testing(minitaur, bank, Test(), devices.mesh(jax.devices()[:1])).start()
+    assert queue.episode.shape == (64,)
+    assert minitaur.at_once(10) == 10
 
 
 def test_physics_that_is_not_finite_ends_the_lane(minitaur: Minitaur, starts: State) -> None:

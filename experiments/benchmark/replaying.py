@@ -22,7 +22,7 @@ def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
       program_alone: leave out the sending and bringing back.
     """
     assert LR.generalize
-    segment, lanes = LR.generalize.segment, bench.options.wide
+    segment, lanes = LR.generalize.segment, bench.robot.at_once(bench.options.wide)
     blocks = Blocks(bench.once(record), segment, lanes, bench.mesh.size)
     key = jax.random.key(0)
     keys, block = blocks.example(key)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from genidm import devices
 from genidm.errors import BadInput
 from genidm.symmetry import Layout
 
@@ -91,6 +92,13 @@ class Robot(abc.ABC):
     @abc.abstractmethod
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         """Control and contact costs `[B]` of the step that led to `state` under `action`."""
+
+    def at_once(self, lanes: int) -> int:
+        """Robots to step at once for who asks for `lanes`, where no result depends on their number.
+
+        On an accelerator more, which few do not keep busy.
+        """
+        return devices.at_once(lanes)
 
     def drawing(self) -> mujoco.MjSpec:
         """A MuJoCo model that shows what the robot looks like, the caller's to change.
