@@ -29,6 +29,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	  --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	@touch $@
+	@echo "Installed. For python to mean this one, here: source $(VENV)/bin/activate"
 
 demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
 	$(BIN)/python -m experiments.ant_rs --scale quick --out runs/demo

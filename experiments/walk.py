@@ -8,9 +8,9 @@ from typing import Annotated
 import tyro
 
 from genidm import controller
+from genidm.errors import BadInput
 from genidm.evaluate import walking_speed
 from genidm.experiment import guarded
-from genidm.robots import by_name
 
 
 def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> None:
@@ -19,10 +19,16 @@ def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> No
     Args:
       root: the directory of a robot's stages.
       episodes: episodes of 1000 steps, or up to a fall.
+
+    Raises:
+      BadInput: there is none.
     """
-    robot = by_name(root.name)
-    for path in sorted(root.glob("experience-*/policy")):
-        speed = walking_speed(robot, controller.load(path, robot), episodes)
+    policies = sorted(root.glob("experience-*/policy"))
+    if not policies:
+        raise BadInput(f"no agent has collected under {root}: it is to be as runs/ant is")
+    for path in policies:
+        policy = controller.load(path)
+        speed = walking_speed(policy.robot, policy, episodes)
         name = path.parent.name
         print(f"{name}: {speed.mean():.2f} m/s, {speed.std():.2f} between episodes")
 

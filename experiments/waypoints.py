@@ -16,15 +16,15 @@ from genidm.errors import BadInput
 from genidm.experiment import guarded, saved
 from genidm.report import journeys
 from genidm.report.rows import jsonable
-from genidm.waypoints import Follow, Journeys, follow
+from genidm.waypoints import Follow, Journeys, follow, in_twos
 
 # Metres. It goes ahead, turns both ways, and comes back facing where it started from.
-LOOP = ((3.0, 0.0), (5.0, 2.0), (4.0, 5.0), (0.0, 5.0), (-2.0, 2.0))
+LOOP = (3.0, 0.0, 5.0, 2.0, 4.0, 5.0, 0.0, 5.0, -2.0, 2.0)
 
 
 def main(
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
-    waypoints: tuple[tuple[float, float], ...] = LOOP,
+    waypoints: tuple[float, ...] = LOOP,
     robots: int = 10,
     yaw: float = 0.0,
     seed: int = 0,
@@ -43,18 +43,18 @@ def main(
       settings: of a journey.
 
     Raises:
-      BadInput: runs of different robots, or none.
+      BadInput: runs of different robots, or none; waypoints that are none.
     """
     robot, models = saved(runs)
     if robots < 1:
         raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
-    points, made = np.asarray(waypoints), dict[str, Journeys]()
+    points, made = in_twos(waypoints), dict[str, Journeys]()
     for name, (model, _) in models.items():
         made[name] = follow(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}
-    written = {"waypoints": waypoints, "methods": jsonable(summary, digits=4), **environment()}
+    written = {"waypoints": points, "methods": jsonable(summary, digits=4), **environment()}
     name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", written)
     journeys(made, settings.reach, out / f"{name}.png")
@@ -66,8 +66,9 @@ def sentence(made: Journeys) -> str:
     found = made.summary()
     whole = made.times[np.isfinite(made.times).all(1), -1]
     took = f", in {whole.mean():.1f} s" if len(whole) else ""
+    each = " ".join(str(n) for n in (made.arrival >= 0).sum(0))
     return (
-        f"{len(whole)} of {found['journeys']} through all waypoints{took}; "
+        f"{len(whole)} of {found['journeys']} through all waypoints{took} ({each} reached each); "
         f"{found['deviation']:.2f} m from the path, body {np.degrees(found['askew'] or 0):.0f}° "
         f"from its course, {found['fell']:.0%} fell"
     )

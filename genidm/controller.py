@@ -65,7 +65,11 @@ class Controller(flax.struct.PyTreeNode):
         Args:
           s: states `[..., S]`.
           displacement: `[..., 3]`, from the robot to where it should go, metres.
+
+        Raises:
+          BadInput: their shapes do not fit the robot, or each other.
         """
+        s = self.robot.heard(s, displacement)
         s, d = in_frame(self.robot, self.frame, s, direction(displacement))
         return jnp.clip(self.raw(s, d), -1.0, 1.0)
 
@@ -129,7 +133,13 @@ def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
       BadInput: the directory is torn, or the controller is another robot's.
     """
     inside = Path(path) / "controller"
-    tree, meta = files.load_arrays(inside if inside.is_dir() else path)
+    place = inside if inside.is_dir() else Path(path)
+    if place.exists() and not (place / files.MANIFEST).exists():
+        raise BadInput(
+            f"{path} holds no controller: it lies in the directory of a fit or a baseline "
+            "(METHOD-SEED-…), once that is finished"
+        )
+    tree, meta = files.load_arrays(place)
     if tree.keys() != {"params", "mean", "std"}:
         raise BadInput(f"{path} holds no controller")
     robot = robot or by_name(meta["robot"])

@@ -180,7 +180,8 @@ def run(
         while done < testing.total:
             queue, calls = step(queue), calls + 1
             before, done = done, testing.ended(queue)
-            bar.advance(done - before, useful=testing.useful(queue, calls))
+            told = testing.useful(queue, calls), testing.longest(queue)
+            bar.advance(done - before, useful=told[0], longest=told[1])
             if checkpoints and checkpoints.due():
                 checkpoints.save(calls, queue)
     return testing.outcome(queue), testing.ways(queue)
@@ -270,6 +271,10 @@ class Testing:
         running = np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0)
         steps = np.asarray(queue.ended.steps).sum() + running.sum()
         return float(steps / (calls * self.settings.chunk * queue.episode.shape[0]))
+
+    def longest(self, queue: Queue) -> int:
+        """Steps of the longest episode under way; until it ends there may be none to count."""
+        return int(np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0).max())
 
     def outcome(self, queue: Queue) -> Outcome:
         """Outcomes `[N]`, in the order of the bank."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -176,6 +177,7 @@ def guarded(command: Callable[..., None], description: str) -> None:
 
     The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
     """
+    warnings.showwarning = _warn
     try:
         tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,))
     except BadInput as error:
@@ -184,3 +186,11 @@ def guarded(command: Callable[..., None], description: str) -> None:
     except KeyboardInterrupt:
         print("stopped: the same command goes on where it was", file=sys.stderr)
         sys.exit(130)
+
+
+def _warn(
+    message: Warning | str, category: Any, filename: str, lineno: int, file: Any = None,
+    line: str | None = None,
+) -> None:  # fmt: skip
+    """A warning as a user wants it: what is the matter, not which line of ours said so."""
+    print(f"warning: {message}", file=sys.stderr)

@@ -35,6 +35,10 @@ class Method:
     agent: PPO | SAC | DDPG | RandomActions | Frozen
     task: WalkForward | GoToGoal
 
+    def __post_init__(self) -> None:
+        if not self.name.strip() or "/" in self.name or self.name.startswith("."):
+            raise BadInput(f"a method's name begins directories: not {self.name!r}")
+
 
 @dataclasses.dataclass(frozen=True)
 class Direct(Method):
@@ -67,6 +71,7 @@ class Inverse(Method):
     fit: Fit
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.share <= 1:
             raise BadInput(f"share must lie in (0, 1], not at {self.share}")
         if self.look_ahead < 1:

@@ -59,7 +59,7 @@ def pairs(
       mirror: adds the reflection y → −y of every sample, in every view.
 
     Raises:
-      BadInput: look_ahead is below 1, or the record is unusable.
+      BadInput: look_ahead is below 1 or longer than all episodes, or the record is unusable.
     """
     if look_ahead < 1:
         raise BadInput(f"look_ahead must be at least 1, not {look_ahead}")
@@ -74,6 +74,11 @@ def pairs(
     if 0 < valid.mean() < FEW:
         said = f"look_ahead {look_ahead} leaves {valid.sum()} of {valid.size} steps to learn from"
         warnings.warn(f"{said}: the episodes of the others end sooner", stacklevel=2)
+    if not exists.any():
+        raise BadInput(
+            f"no episode lasts look_ahead = {look_ahead} steps: make it less "
+            "(--method.look-ahead), or collect more (--scale)"
+        )
     out = _samples(views, np.asarray(experience.a), valid)
     return with_reflection(robot, out) if mirror else out
 
@@ -101,7 +106,7 @@ def _samples(views: list[tuple[np.ndarray, np.ndarray]], a: np.ndarray, valid: n
     length = np.stack([np.linalg.norm(way, axis=-1) for _, way in views])
     keep = valid & (length > 1e-6).all(axis=0)
     if not keep.any():
-        raise BadInput("no sample can be learned from: are all episodes shorter than look_ahead?")
+        raise BadInput("no sample can be learned from: no step of it is valid and leads anywhere")
     s = np.stack([s[keep] for s, _ in views])
     d = np.stack([way[keep] for _, way in views]) / length[:, keep, None]
     return Pairs(s, d, a[keep])

@@ -95,6 +95,7 @@ class Progress:
             unit_scale=True,
             dynamic_ncols=True,
             mininterval=0.2 if live else 10.0,  # a log file gets a line now and then
+            miniters=0,  # metrics may tell more than units do
             disable=quiet,
             file=sys.stderr,
         )

@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from genidm.errors import BadInput
+
 Array = jax.Array
 
 
@@ -83,6 +85,7 @@ class Field:
       mirror: x [..., size] → x after the reflection y → −y.
       yaw: x [..., size] → heading [...], for a field that holds one.
       sound: x [..., size] → whether all of it can be such numbers.
+      canonical: x [..., size] → the one that stands for it, where several mean the same.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Field:
     mirror: Mirror
     yaw: Callable[[Array], Array] | None = None
     sound: Callable[[np.ndarray], bool] | None = None
+    canonical: Callable[[Array], Array] | None = None
 
 
 def _signed(signs: Sequence[float], permutation: Sequence[int] | None = None) -> Mirror:
@@ -101,6 +105,13 @@ def _signed(signs: Sequence[float], permutation: Sequence[int] | None = None) ->
         return lambda x: x * factors
     order = np.asarray(permutation)
     return lambda x: x[..., order] * factors
+
+
+def _across(name: str, permutation: Sequence[int]) -> None:
+    """Refuses what does not send each of them to one, and back."""
+    order = list(permutation)
+    if sorted(order) != list(range(len(order))) or [order[i] for i in order] != sorted(order):
+        raise BadInput(f"{name!r}: each has one mirror image, which it is of; not {order}")
 
 
 def _keep(x: Array, yaw: Array) -> Array:
@@ -128,9 +139,14 @@ def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
 
 
 def quaternion(name: str) -> Field:
-    """An orientation, given with w ≥ 0 because q and −q are one orientation but two inputs."""
+    """An orientation (w, x, y, z) with w ≥ 0: q and −q are one orientation but two inputs.
+
+    ROS, PyBullet and scipy have (x, y, z, w).
+    """
     mirror = _signed([1, -1, 1, -1])
-    return Field(name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _upright_units)
+    return Field(
+        name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _upright_units, positive
+    )
 
 
 def _upright_units(q: np.ndarray) -> bool:
@@ -163,7 +179,13 @@ def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: 
       permutation: for each joint the index of its mirror image.
       signs: for each joint the sign that the number takes on.
       unit: of each number.
+
+    Raises:
+      BadInput: the permutation is none, or the signs are not as many.
     """
+    _across(name, permutation)
+    if len(signs) != len(permutation):
+        raise BadInput(f"{name!r} has {len(permutation)} joints, but {len(signs)} signs")
     mirror = _signed(signs, permutation)
     return Field(name, len(permutation), "joints", unit, _keep, mirror)
 
@@ -174,7 +196,11 @@ def wrenches(name: str, permutation: Sequence[int]) -> Field:
     Args:
       name: what the numbers are.
       permutation: for each body the index of its mirror image.
+
+    Raises:
+      BadInput: the permutation is none.
     """
+    _across(name, permutation)
     count, order = len(permutation), np.asarray(permutation)
     signs = np.asarray([-1, 1, -1, 1, -1, 1], np.float32)
 
@@ -222,6 +248,13 @@ class Layout:
         """Names of fields of which x `[..., n]` on the host holds what they cannot be."""
         parts = zip(self.fields, np.split(x, self._edges, axis=-1), strict=True)
         return [f.name for f, part in parts if f.sound is not None and not f.sound(part)]
+
+    def canonical(self, x: Array) -> Array:
+        """x `[..., n]` with w ≥ 0 in its quaternions."""
+        if all(f.canonical is None for f in self.fields):
+            return x
+        parts = zip(self.fields, self._split(x), strict=True)
+        return jnp.concatenate([f.canonical(p) if f.canonical else p for f, p in parts], axis=-1)
 
     def turn(self, x: Array, yaw: Array) -> Array:
         """x `[..., n]` after the world is turned by `yaw [...]` about the origin's vertical."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.struct
@@ -187,18 +187,20 @@ def follow(
       quiet: no progress bar.
 
     Raises:
-      BadInput: no waypoints, or not of two or three finite numbers each.
+      BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key.
     """
     settings, mesh = settings or Follow(), mesh or devices.mesh()
-    points = _checked(waypoints, len(yaw), robot.standing_height)
+    if jnp.ndim(keys) != 1 or jnp.shape(yaw) != keys.shape:
+        raise BadInput(f"keys [B] and yaw [B] are of {keys.shape} and {jnp.shape(yaw)}")
+    points = _checked(waypoints, len(keys), robot.standing_height)
     walker = _start(robot, points, keys, yaw, mesh)
     controller = devices.put(controller, mesh, None)
     look = functools.partial(_seen, watch)
     body = functools.partial(_chunk, robot, planner, settings, look)
     sharded = devices.over_lanes(body, mesh, [None, 0], (0, 1))
-    step = compiled("waypoints", jax.jit(sharded, donate_argnums=1), controller, walker)
+    step = compiled("journeys", jax.jit(sharded, donate_argnums=1), controller, walker)
     seen = [jax.tree.map(lambda x: np.asarray(x)[None], look(walker.robots))]
-    with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
+    with Progress("journeys", settings.max_steps, "steps", quiet=quiet) as bar:
         for made in range(0, settings.max_steps, settings.chunk):
             walker, way = step(controller, walker)
             seen.append(jax.tree.map(np.asarray, way))
@@ -206,6 +208,17 @@ def follow(
             if not np.asarray(walker.going).any():
                 break
     return _journeys(robot, walker, seen, len(yaw))
+
+
+def in_twos(numbers: Sequence[float]) -> np.ndarray:
+    """Waypoints `[W, 2]` from x and y, x and y, …, as a command line gives them.
+
+    Raises:
+      BadInput: a number is left over.
+    """
+    if len(numbers) % 2:
+        raise BadInput(f"waypoints are x and y of each: an even number, not {len(numbers)}")
+    return np.reshape(numbers, (-1, 2))
 
 
 def _start(robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, mesh: Mesh) -> Walker:
@@ -249,7 +262,10 @@ def _journeys(robot: Robot, walker: Walker, seen: list[Any], count: int) -> Jour
 
 def _checked(waypoints: Any, count: int, height: float) -> np.ndarray:
     """Waypoints `[B, W, 3]` of so many robots; raises BadInput for what is none."""
-    points = np.asarray(waypoints, float)
+    try:
+        points = np.asarray(waypoints, float)
+    except ValueError:
+        raise BadInput("waypoints are rows of two or three numbers, each of as many") from None
     shaped = points.ndim in (2, 3) and points.shape[-1] in (2, 3) and points.shape[-2] > 0
     if not shaped or (points.ndim == 3 and len(points) != count):
         raise BadInput(

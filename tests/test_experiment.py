@@ -363,11 +363,15 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
     for wrong, why in (((), "of a run"), (runs, "robots must")):
         with pytest.raises(BadInput, match=why):
             waypoints.main(wrong, robots=0, out=tmp_path)
+    with pytest.raises(BadInput, match="an even number, not 3"):
+        waypoints.main(runs, (3.0, 0.0, 5.0), out=tmp_path)
 
 
 def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:
     """Of the agents that learned; random actions leave no policy."""
-    monkeypatch.setattr(walk, "by_name", lambda name: {"point": Point()}[name])
+    monkeypatch.setattr(controller, "by_name", lambda name: {"point": Point()}[name])
+    with pytest.raises(BadInput, match="no agent has collected"):
+        walk.main(finished.out)
     walk.main(finished.out / "point", episodes=4)
     (line,) = capsys.readouterr().out.splitlines()
     name, speed = line.split(": ")

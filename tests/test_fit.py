@@ -299,6 +299,8 @@ def test_what_is_no_controller_is_refused(tmp_path: Path) -> None:
     files.save_arrays(tmp_path / "arrays", {"s": np.zeros(3)}, {})
     with pytest.raises(BadInput, match="holds no controller"):
         controller.load(tmp_path / "arrays", ROBOT)
+    with pytest.raises(BadInput, match="METHOD-SEED"):
+        controller.load(tmp_path)  # as the directory of a test, or of a run under way
 
 
 def test_a_controller_is_not_saved_over_another_unless_asked(tmp_path: Path) -> None:
@@ -312,7 +314,7 @@ def test_a_controller_is_not_saved_over_another_unless_asked(tmp_path: Path) -> 
 
 def test_actions_are_clipped_and_see_only_the_direction() -> None:
     one, data = model(K), samples(views=1)
-    s, d = data.s[0], data.d[0]
+    s, d = ROBOT.observation.canonical(data.s[0]), data.d[0]
     a, raw = act(one, s, 3.7 * d), jax.jit(Controller.raw)(one, s, d)
     np.testing.assert_allclose(a, act(one, s, d), atol=1e-5)
     np.testing.assert_allclose(a, np.clip(raw, -1, 1), atol=1e-5)
@@ -375,8 +377,12 @@ def test_a_fit_of_nothing_is_refused(wrong: dict) -> None:
         Fit(**wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"look_ahead": 0}, {"share": 0.0}, {"share": 1.5}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"look_ahead": 0}, {"share": 0.0}, {"share": 1.5}, {"name": "a/b"}, {"name": ".."}],
+)
 def test_methods_refuse_what_they_cannot_do(wrong: dict) -> None:
+    """A name begins those of directories."""
     with pytest.raises(BadInput, match=next(iter(wrong))):
         dataclasses.replace(LR, **wrong)
 

@@ -103,7 +103,7 @@ def test_what_ends_before_the_look_ahead_is_left_out() -> None:
     assert 0 < np.asarray(exist).sum() < r.interactions
     samples = pairs(ROBOT, r, look_ahead=4)
     close(samples.a, np.asarray(r.a)[np.asarray(exist)])
-    with pytest.raises(BadInput, match="no sample"):
+    with pytest.raises(BadInput, match="no episode lasts look_ahead = 100 steps"):
         pairs(ROBOT, r, look_ahead=100)
 
 
@@ -251,7 +251,7 @@ def test_a_sample_without_a_direction_is_dropped_and_none_at_all_is_refused() ->
     with pytest.raises(BadInput, match="no sample"):
         pairs(ROBOT, r.replace(o_next=r.o), look_ahead=1)
     with pytest.raises(BadInput, match="no sample"):
-        pairs(ROBOT, r.replace(valid=np.zeros((30, 5), bool)))
+        pairs(ROBOT, r.replace(valid=np.zeros((30, 5), bool)), look_ahead=1)
 
 
 def test_a_replay_that_is_lost_whole_has_no_residual() -> None:

@@ -15,7 +15,8 @@ PACKAGE = Path(genidm.__file__).parent
 
 # Modules on one line know nothing of each other.
 ORDER = """
-errors episodes symmetry devices quiet
+errors episodes devices quiet
+symmetry
 genidm
 config
 files

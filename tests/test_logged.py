@@ -58,6 +58,9 @@ def test_a_log_becomes_a_controller(tmp_path: Path) -> None:
     again = controller.load(tmp_path / "run", robot)  # the run's directory will do
     s, way = log().s[0], jnp.asarray([[1.0, 0.0, 0.0]] * 3)
     np.testing.assert_allclose(again(s, way), model(s, way), atol=1e-6)
+    # −q is the orientation that q is.
+    other = jnp.concatenate([-s[:, :4], s[:, 4:]], axis=-1)
+    np.testing.assert_array_equal(model(other, way), model(s, way))
     with pytest.raises(BadInput, match="no robot is called 'mine'"):
         controller.load(tmp_path / "run")
 
@@ -65,6 +68,17 @@ def test_a_log_becomes_a_controller(tmp_path: Path) -> None:
 def test_a_look_ahead_that_leaves_little_is_said() -> None:
     with pytest.warns(UserWarning, match="look_ahead 50 leaves 33 of 180 steps"):
         generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), look_ahead=50)
+
+
+def test_what_is_told_of_other_sizes_is_refused() -> None:
+    for s, way in (((7,), (2,)), ((7,), (1,)), ((6,), (3,)), ((2, 7), (3,))):
+        with pytest.raises(BadInput, match=r"s \[..., 7\] and a way \[..., 3\]"):
+            Mine().heard(np.zeros(s), np.zeros(way))
+
+
+def test_a_look_ahead_longer_than_all_episodes_is_said() -> None:
+    with pytest.raises(BadInput, match="no episode lasts look_ahead = 61 steps"):
+        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), look_ahead=61)
 
 
 def test_nothing_can_be_stepped() -> None:

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from genidm import symmetry
+from genidm.errors import BadInput
 from genidm.symmetry import Field, Layout
 
 LANES = 64
@@ -182,6 +183,19 @@ def test_torques_transform_as_arm_times_force(rng: np.random.Generator) -> None:
 
 def test_joints_go_to_the_joint_across() -> None:
     assert FIELDS[4].mirror(jnp.array([1.0, 2.0, 3.0])).tolist() == [-2.0, -1.0, 3.0]
+
+
+@pytest.mark.parametrize("order", [[1, 2], [0, 0], [1, 2, 0], [-1, 0]])
+def test_what_is_across_is_across_from_it(order: list[int]) -> None:
+    for make in (lambda: symmetry.joints("legs", order, [1] * len(order), "rad"),
+                 lambda: symmetry.wrenches("feet", order)):  # fmt: skip
+        with pytest.raises(BadInput, match="one mirror image"):
+            make()
+
+
+def test_joints_have_as_many_signs() -> None:
+    with pytest.raises(BadInput, match="2 joints, but 1 signs"):
+        symmetry.joints("legs", [1, 0], [1], "rad")
 
 
 def test_angles_are_those_of_scipy(rng: np.random.Generator) -> None:

@@ -407,7 +407,7 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
     main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)
     assert inside((tmp_path / "again.html").read_text()) == beside  # found by its run alone
-    main((path.parent,), (tmp_path / "way.html",), (4, 1), waypoints=((9.0, 0.0), (0.0, 9.0)))
+    main((path.parent,), (tmp_path / "way.html",), (4, 1), waypoints=(9.0, 0.0, 0.0, 9.0))
     with pytest.raises(BadInput, match="of one run"):
         main((path.parent,) * 2)
     way = inside((tmp_path / "way.html").read_text())

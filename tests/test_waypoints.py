@@ -119,8 +119,17 @@ def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
     for wrong in (np.zeros((0, 2)), np.zeros(3), [[1.0, np.nan]], np.zeros((2, 4))):
         with pytest.raises(BadInput, match="waypoints"):
             journey(Point(), waypoints=wrong)
+    with pytest.raises(BadInput, match="each of as many"):
+        journey(Point(), waypoints=[[1.0, 2.0], [3.0]])
     with pytest.raises(BadInput, match="reach above 0"):
         Follow(reach=0.0)
+
+
+def test_a_robot_has_a_key_and_a_yaw() -> None:
+    keys = jax.random.split(jax.random.key(0), 2)
+    for yaw in (np.zeros(3), 0.0):
+        with pytest.raises(BadInput, match=r"keys \[B\] and yaw \[B\]"):
+            follow(Point(), lambda s, way: way, WAYPOINTS, keys, yaw)
 
 
 def test_each_robot_may_have_waypoints_of_its_own(made: Journeys) -> None:

@@ -58,7 +58,12 @@ class Policy(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
 
     def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        """Actions `[..., A]` for states `[..., S]` and ways to the goal `[..., 3]`, metres."""
+        """Actions `[..., A]` for states `[..., S]` and ways to the goal `[..., 3]`, metres.
+
+        Raises:
+          BadInput: their shapes do not fit the robot, or each other.
+        """
+        s = self.robot.heard(s, displacement)
         x = inputs(s, displacement if self.directed else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
         outputs = self.params["params"][f"hidden_{len(self.hidden)}"]["bias"].shape[-1]

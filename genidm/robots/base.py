@@ -93,6 +93,22 @@ class Robot(abc.ABC):
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         """Control and contact costs `[B]` of the step that led to `state` under `action`."""
 
+    def heard(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+        """s `[..., S]` as its controllers were taught it, with w ≥ 0 in its quaternions.
+
+        Args:
+          s: of whoever asks for an action.
+          displacement: `[..., 3]`, the way that it asks for.
+
+        Raises:
+          BadInput: their shapes do not fit the robot, or each other.
+        """
+        state, way = jnp.shape(s), jnp.shape(displacement)
+        if state[-1:] != (self.observation.size,) or way != (*state[:-1], 3):
+            wanted = f"s [..., {self.observation.size}] and a way [..., 3] in metres"
+            raise BadInput(f"the {self.name} is told {wanted}, not {state} and {way}")
+        return self.observation.canonical(jnp.asarray(s))
+
     def at_once(self, lanes: int) -> int:
         """Robots to step at once for who asks for `lanes`, where no result depends on their number.
 

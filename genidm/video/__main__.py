@@ -11,14 +11,14 @@ from genidm import video
 from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.video.filming import LONGEST
-from genidm.waypoints import Follow
+from genidm.waypoints import Follow, in_twos
 
 
 def main(
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: tuple[Path, ...] = (),
     episodes: tuple[int, ...] = (),
-    waypoints: tuple[tuple[float, float], ...] = (),
+    waypoints: tuple[float, ...] = (),
     reach: float = Follow.reach,
     seed: int = 0,
     seconds: float = LONGEST,
@@ -55,7 +55,8 @@ def main(
         video.check(path)
     given = {"width": width, "height": height, "fps": fps}
     changes: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
-    made = video.film_run(run, episodes, waypoints or None, seed, seconds, reach)
+    points = in_twos(waypoints) if waypoints else None
+    made = video.film_run(run, episodes, points, seed, seconds, reach)
     for path in paths:
         video.write(made, path, **changes)
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
