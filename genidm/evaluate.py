@@ -180,8 +180,8 @@ def run(
         while done < testing.total:
             queue, calls = step(queue), calls + 1
             before, done = done, testing.ended(queue)
-            told = testing.useful(queue, calls), testing.longest(queue)
-            bar.advance(done - before, useful=told[0], longest=told[1])
+            useful, longest = testing.useful(queue, calls), testing.longest(queue)
+            bar.advance(done - before, useful=useful, longest=longest)
             if checkpoints and checkpoints.due():
                 checkpoints.save(calls, queue)
     return testing.outcome(queue), testing.ways(queue)
