@@ -268,13 +268,16 @@ class Testing:
 
     def useful(self, queue: Queue, calls: int) -> float:
         """Share of the lane-steps of so many calls that were spent in episodes."""
-        running = np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0)
-        steps = np.asarray(queue.ended.steps).sum() + running.sum()
+        steps = np.asarray(queue.ended.steps).sum() + self._under_way(queue).sum()
         return float(steps / (calls * self.settings.chunk * queue.episode.shape[0]))
 
     def longest(self, queue: Queue) -> int:
         """Steps of the longest episode under way; until it ends there may be none to count."""
-        return int(np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0).max())
+        return int(self._under_way(queue).max())
+
+    def _under_way(self, queue: Queue) -> np.ndarray:
+        """Steps `[lanes]` of the episode that each lane is at; 0 for one that has none."""
+        return np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0)
 
     def outcome(self, queue: Queue) -> Outcome:
         """Outcomes `[N]`, in the order of the bank."""

@@ -72,6 +72,8 @@ class Blocks:
       start: `[T, B]` int32, for each step that of the last placement.
       length: steps of a block, H.
       width: lanes of a block.
+      count: columns of the record in all blocks.
+      stride: columns that a block has of its own; the rest of its lanes are padding.
       follow: whether blocks follow one another.
     """
 
@@ -85,8 +87,10 @@ class Blocks:
         self.placed = first | (time % (self.steps if follow else length) == 0)
         self.start = np.maximum.accumulate(np.where(self.placed, time, 0), axis=0)
         self.shape = (-(-self.steps // length), recorded)
-        width = recorded if follow else min(lanes, self.shape[0] * recorded)
+        self.count = self.shape[0] * recorded
+        width = recorded if follow else min(lanes, self.count)
         self.width = -(-width // among) * among
+        self.stride = recorded if follow else self.width
         source = dict(
             physics=experience.physics, s=experience.s, a=experience.a,
             placed=self.placed, valid=experience.valid,
@@ -101,9 +105,9 @@ class Blocks:
         return x.reshape(self.length, -1, *x.shape[3:])
 
     def __iter__(self) -> Iterator[Block]:
-        step = self.shape[1] if self.follow else self.width
-        for begin in range(0, self.shape[0] * self.shape[1], step):
-            yield jax.tree.map(functools.partial(self._pad, begin, begin + step), self.columns)
+        for begin in range(0, self.count, self.stride):
+            end = begin + self.stride
+            yield jax.tree.map(functools.partial(self._pad, begin, end), self.columns)
 
     def _pad(self, begin: int, end: int, columns: np.ndarray) -> np.ndarray:
         x = columns[:, begin:end]
@@ -113,8 +117,7 @@ class Blocks:
     @property
     def total(self) -> int:
         """Steps in all blocks, the padding counted."""
-        step = self.shape[1] if self.follow else self.width
-        return -(-self.shape[0] * self.shape[1] // step) * self.length * self.width
+        return -(-self.count // self.stride) * self.length * self.width
 
     def example(self, key: jax.Array) -> tuple[jax.Array, Block]:
         """Arguments of the first call, to compile for."""
@@ -122,11 +125,9 @@ class Blocks:
 
     def gather(self, outputs: list[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
         """Outputs of all blocks as arrays `[T, B, ...]`."""
-        step = self.shape[1] if self.follow else self.width
 
         def join(*parts: np.ndarray) -> np.ndarray:
-            x = np.concatenate([p[:, :step] for p in parts], axis=1)
-            x = x[:, : self.shape[0] * self.shape[1]]
+            x = np.concatenate([p[:, : self.stride] for p in parts], axis=1)[:, : self.count]
             x = x.reshape(self.length, *self.shape, *x.shape[2:]).swapaxes(0, 1)
             return x.reshape(-1, *x.shape[2:])[: self.steps]
 
