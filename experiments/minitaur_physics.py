@@ -30,18 +30,18 @@ from genidm.config import environment
 from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.robots import Minitaur
-from genidm.robots.bullet import (
+from genidm.robots.minitaur import from_rows
+from genidm.robots.minitaur_world import (
     ACTIONS,
-    Engine,
     Simulation,
+    Solver,
     has_fallen,
     parts,
     stepped,
 )
-from genidm.robots.minitaur import from_rows
 
-ORIGINAL = Engine(iterations=60, self_collision=True, cone=True)
-OURS = Engine()
+ORIGINAL = Solver(iterations=60, self_collision=True, cone=True)
+OURS = Solver()
 STEPS = 500
 LOOK = (5, 10, 20, 50, 100, 200, 500)
 # Each is shaken for so many control steps before it walks, so that no two walk alike.
@@ -98,16 +98,16 @@ class OneByOne(Simulation):
             )
 
 
-def hard(engine: Engine, yaw: float, actions: np.ndarray) -> np.ndarray:
+def hard(solver: Solver, yaw: float, actions: np.ndarray) -> np.ndarray:
     """o `[T, 3]` after each of the actions, from a hard reset at `yaw`, never placed."""
-    simulation = Simulation(engine)
+    simulation = Simulation(solver)
     simulation.reset(yaw)
     return np.array([live(simulation, action)[:3] for action in actions])
 
 
-def placed(engine: Engine, row: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def placed(solver: Solver, row: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """o `[T, 3]` after each of the actions, as 𝒢 has it: placed anew in float32 at each step."""
-    simulation, positions = Simulation(engine), []
+    simulation, positions = Simulation(solver), []
     for action in actions:
         row = again(simulation, action, row)
         positions.append(row[:3])
@@ -125,14 +125,14 @@ def again(simulation: Simulation, action: np.ndarray, row: np.ndarray) -> np.nda
     return stepped(simulation, np.concatenate([row, action]).astype(np.float32))
 
 
-def settled(engine: Engine) -> np.ndarray:
+def settled(solver: Solver) -> np.ndarray:
     """The row of the settled start."""
-    return Simulation(engine).read()
+    return Simulation(solver).read()
 
 
-def walk(engine: Engine, anew: bool, seed: int) -> list[float]:
+def walk(solver: Solver, anew: bool, seed: int) -> list[float]:
     """One walk: metres ahead, mean height (m), mean pitch (rad), steps until it fell, ms a step."""
-    simulation, rng = Simulation(engine), np.random.default_rng(seed)
+    simulation, rng = Simulation(solver), np.random.default_rng(seed)
     for action in 0.3 * shakes(rng, SHAKEN):
         simulation.step(action)
     row, heights, pitches = simulation.read(), [], []
@@ -149,9 +149,9 @@ def walk(engine: Engine, anew: bool, seed: int) -> list[float]:
     return [row[0] - start, np.mean(heights), np.mean(pitches), len(heights), spent]
 
 
-def cost(engine: Engine, batched: bool) -> float:
+def cost(solver: Solver, batched: bool) -> float:
     """ms of CPU that a control step of a walking robot takes."""
-    simulation = (Simulation if batched else OneByOne)(engine)
+    simulation = (Simulation if batched else OneByOne)(solver)
     began = time.process_time()
     for action in gait()[:100]:
         simulation.step(action)
@@ -187,10 +187,10 @@ def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
         "random": [shakes(rng, STEPS) for _ in range(options.lanes)],
     }
     for cone in (False, True):
-        engine = [dataclasses.replace(OURS, cone=cone)] * options.lanes
+        solver = [dataclasses.replace(OURS, cone=cone)] * options.lanes
         for start in ("hard reset", "placed"):
             for name, actions in told.items():
-                straight, turned = replays(jobs, start, engine, yaw, actions)
+                straight, turned = replays(jobs, start, solver, yaw, actions)
                 exact = symmetry.turn_vector(jnp.asarray(straight), jnp.asarray(yaw)[:, None])
                 apart = np.linalg.norm(np.asarray(exact) - turned, axis=-1)[:, np.array(LOOK) - 1]
                 rows.append(
@@ -203,19 +203,19 @@ def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
 
 
 def replays(
-    jobs: Jobs, start: str, engine: list[Engine], yaw: np.ndarray, actions: list[np.ndarray]
+    jobs: Jobs, start: str, solver: list[Solver], yaw: np.ndarray, actions: list[np.ndarray]
 ) -> Iterator[np.ndarray]:
     """o `[lanes, T, 3]`, from yaw 0 and from `yaw [lanes]`."""
     if start == "hard reset":
-        return (jobs(hard, engine, way, actions) for way in (0 * yaw, yaw))
-    row = jobs(settled, engine[:1])[0]
+        return (jobs(hard, solver, way, actions) for way in (0 * yaw, yaw))
+    row = jobs(settled, solver[:1])[0]
     physics = jax.tree.map(
         lambda x: jnp.tile(x, (len(yaw), 1)), from_rows(jnp.asarray(row, jnp.float32))
     )
-    robot = Minitaur(engine[0])
+    robot = Minitaur(solver[0])
     turned = (robot.turn_physics(physics, jnp.asarray(way)) for way in (0 * yaw, yaw))
     starts = (np.concatenate(jax.tree.leaves(jax.device_get(p)), axis=-1) for p in turned)
-    return (jobs(placed, engine, list(rows), actions) for rows in starts)
+    return (jobs(placed, solver, list(rows), actions) for rows in starts)
 
 
 WALKERS = {
@@ -234,11 +234,11 @@ def fidelity(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
     """The same walk under other settings: mean and standard error over the lanes."""
     rows, names = [], ("ahead", "height", "pitch", "steps", "ms")
     seeds = [options.seed + lane for lane in range(options.lanes)]
-    for name, (engine, anew) in WALKERS.items():
-        walks = jobs(walk, [engine] * len(seeds), [anew] * len(seeds), seeds)
+    for name, (solver, anew) in WALKERS.items():
+        walks = jobs(walk, [solver] * len(seeds), [anew] * len(seeds), seeds)
         error = walks.std(0) / np.sqrt(len(walks))
         means = dict(zip(names, zip(walks.mean(0), error, strict=True), strict=True))
-        rows.append({"setting": name, "engine": engine, "placed": anew, **means})
+        rows.append({"setting": name, "solver": solver, "placed": anew, **means})
     return rows
 
 
@@ -251,8 +251,8 @@ def calls(jobs: Jobs) -> list[dict[str, Any]]:
     engines = [dataclasses.replace(OURS, self_collision=collides) for collides, _ in kinds]
     spent = [
         [
-            jobs(cost, [engine], [batched])[0]
-            for engine, (_, batched) in zip(engines, kinds, strict=True)
+            jobs(cost, [solver], [batched])[0]
+            for solver, (_, batched) in zip(engines, kinds, strict=True)
         ]
         for _ in range(REPEATS)
     ]

@@ -98,7 +98,7 @@ def ours(processes: int, actions: np.ndarray, lanes: int = 128) -> Vectorised:
         step(state, action).position.block_until_ready()
 
     once()
-    pids = [w.process.pid for w in robot._pool._idle.queue if w]
+    pids = [w.process.pid for w in robot.engine.pool._idle.queue if w]
     return Vectorised("Minitaur", lanes, pids, once)
 
 

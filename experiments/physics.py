@@ -27,11 +27,13 @@ from mujoco.rollout import Rollout
 
 from genidm import devices, files, symmetry
 from genidm.config import environment
+from genidm.engines import Physics
 from genidm.errors import BadInput
 from genidm.experiment import guarded
 from genidm.progress import Progress, compiled
 from genidm.robots import Ant, Humanoid, State
-from genidm.robots.mjx import MjxRobot, Physics, Solver, select
+from genidm.robots.base import select
+from genidm.robots.mujoco import MujocoRobot, Solver
 
 ROBOTS = {"ant": Ant, "humanoid": Humanoid}
 
@@ -83,7 +85,7 @@ class Options:
         """Threads of MuJoCo in C."""
         return jax.device_count() if self.threads is None else self.threads
 
-    def with_solver(self, solver: Solver) -> MjxRobot:
+    def with_solver(self, solver: Solver) -> MujocoRobot:
         """The robot, under these settings of the solver."""
         return ROBOTS[self.robot](solver)
 
@@ -104,7 +106,7 @@ def cone(solver: Solver) -> str:
 class InC:
     """Lanes in MuJoCo's C engine, in float64, on a pool of threads."""
 
-    def __init__(self, robot: MjxRobot, threads: int = 1):
+    def __init__(self, robot: MujocoRobot, threads: int = 1):
         self.model, self.frames = robot.mj_model, robot.frames
         self._pool = Rollout(nthread=threads)
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
@@ -142,7 +144,7 @@ def strong(rng: np.random.Generator, steps: int, lanes: int, size: int) -> np.nd
 # ── stability and speed ─────────────────────────────────────────────────────────────────────
 
 
-def endure_in_c(robot: MjxRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
+def endure_in_c(robot: MujocoRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
     """Shakes lanes in C; one that blows up sits out the rest of its episode.
 
     Returns:
@@ -170,7 +172,9 @@ def endure_in_c(robot: MjxRobot, name: str, episodes: int, options: Options) -> 
     return {"steps": steps, "blow_ups": blow_ups, "seconds": seconds}
 
 
-def endure_in_mjx(robot: MjxRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
+def endure_in_mjx(
+    robot: MujocoRobot, name: str, episodes: int, options: Options
+) -> dict[str, float]:
     """Shakes lanes sharded over the devices; one that blows up starts afresh at once.
 
     Returns:
@@ -191,7 +195,7 @@ def endure_in_mjx(robot: MjxRobot, name: str, episodes: int, options: Options) -
     return {"steps": episodes * EPISODE * options.lanes, "blow_ups": blow_ups, "seconds": seconds}
 
 
-def shaken(robot: MjxRobot) -> Any:
+def shaken(robot: MujocoRobot) -> Any:
     """A function of keys `[B]`: blow-ups `[B]` in an episode from fresh starts."""
 
     def action(key: jax.Array) -> jax.Array:
@@ -238,7 +242,9 @@ def starts(options: Options) -> Physics:
     return Physics(qpos, qvel, np.zeros_like(qvel))
 
 
-def drift_in_c(robot: MjxRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def drift_in_c(
+    robot: MujocoRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray
+) -> np.ndarray:
     """Metres `[T, B]` between the turned replay and the replay, turned; in float64."""
     engine = InC(robot)
     with jax.enable_x64(True):  # the turns, too
@@ -250,7 +256,7 @@ def drift_in_c(robot: MjxRobot, start: Physics, yaw: np.ndarray, actions: np.nda
 
 
 def drift_in_mjx(
-    robot: MjxRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray
+    robot: MujocoRobot, start: Physics, yaw: np.ndarray, actions: np.ndarray
 ) -> np.ndarray:
     """The same in MJX and float32, as 𝒢 does it."""
 

@@ -28,6 +28,7 @@ def configure() -> None:
 
     - one CPU device a core (`GENIDM_DEVICES` overrides the number; a number the user
       has already given to jax stands), and three of XLA's threads for each (`PJRT_NPROC`);
+    - programs on a CPU run while their caller waits (`JAX_CPU_ENABLE_ASYNC_DISPATCH` overrides);
     - float32 matrix products at full precision (`JAX_DEFAULT_MATMUL_PRECISION` overrides);
     - the persistent compilation cache on, in `~/.cache/genidm/xla`
       (`JAX_COMPILATION_CACHE_DIR` overrides).
@@ -40,6 +41,10 @@ def configure() -> None:
         os.environ.setdefault("PJRT_NPROC", str(3 * count))
         with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
             jax.config.update("jax_num_cpu_devices", count)
+    # A program that calls the host can wait for itself, for ever, if it runs in the background
+    # (jax issue 25861); MJX on several devices steps as fast without that.
+    if "JAX_CPU_ENABLE_ASYNC_DISPATCH" not in os.environ:
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _setting("jax_default_matmul_precision") is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     if _setting("jax_compilation_cache_dir") is None:

@@ -107,7 +107,7 @@ def evaluate(
       controller: what steers it.
       bank: scenarios `[seeds, episodes]`.
       settings: length of an episode, reach radius, lanes.
-      mesh: devices to share the lanes among; all, unless given.
+      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
       stage: where checkpoints and metrics go; nowhere, unless given.
       quiet: no progress bar.
     """
@@ -158,14 +158,14 @@ def run(
       bank: scenarios `[N]` (`flatten`).
       settings: length of an episode, reach radius, lanes.
       traced: how many of the first episodes to give the ways of.
-      mesh: devices to share the lanes among; all, unless given.
+      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
       stage: where checkpoints and metrics go; nowhere, unless given.
       quiet: no progress bar.
 
     Returns:
       outcomes `[N]`, and for each traced episode its positions `[steps + 1, 3]`.
     """
-    testing = Testing(robot, bank, settings or Test(), mesh or devices.mesh(), traced)
+    testing = Testing(robot, bank, settings or Test(), mesh or robot.mesh(), traced)
     queue, calls = testing.start(), 0
     # Its queues belong to the devices: on others the test begins anew.
     here = f"{testing.mesh.size}_devices_{queue.episode.size}_lanes"

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from genidm import devices, symmetry
+from genidm import symmetry
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.pairs import Pairs, pairs
@@ -66,7 +66,7 @@ def replay(
       experience: E, `[T, B, ...]`.
       key: of the yaws.
       settings: mode, segment length and number of copies.
-      mesh: devices to share the lanes among; all, unless given.
+      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
       quiet: no progress bar.
 
     Raises:
@@ -78,7 +78,7 @@ def replay(
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
-    mesh = mesh or devices.mesh()
+    mesh = mesh or robot.mesh()
     follow = settings.mode == "episodes"
     lanes = robot.at_once(settings.lanes)
     blocks = Blocks(experience, settings.segment, lanes, mesh.size, follow=follow)

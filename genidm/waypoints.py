@@ -183,13 +183,13 @@ def follow(
       planner: where to go next; straight to the next waypoint, unless given.
       settings: length of a journey, reach.
       watch: what to keep of every state beside position and heading; nothing, unless given.
-      mesh: devices to share the robots among; all, unless given.
+      mesh: devices to share the robots among; as their engine wants, unless given.
       quiet: no progress bar.
 
     Raises:
       BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key.
     """
-    settings, mesh = settings or Follow(), mesh or devices.mesh()
+    settings, mesh = settings or Follow(), mesh or robot.mesh()
     if jnp.ndim(keys) != 1 or jnp.shape(yaw) != keys.shape:
         raise BadInput(f"keys [B] and yaw [B] are of {keys.shape} and {jnp.shape(yaw)}")
     points = _checked(waypoints, len(keys), robot.standing_height)

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from genidm import symmetry
+from genidm.engines import Physics
 from genidm.robots import State
-from genidm.robots.mjx import MjxRobot, Physics
+from genidm.robots.mujoco import MujocoRobot
 from genidm.symmetry import Layout
 
 
-def step_in_c(robot: MjxRobot, physics: Physics, actions: np.ndarray) -> tuple[Physics, np.ndarray]:
+def step_in_c(
+    robot: MujocoRobot, physics: Physics, actions: np.ndarray
+) -> tuple[Physics, np.ndarray]:
     """Control steps in float64: physics `[B, ...]` after them, and wrenches `[B, nbody, 6]`.
 
     Args:
@@ -53,13 +56,13 @@ def assert_close(x: Any, y: Any, **tolerance: float) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), x, y)
 
 
-def placed(robot: MjxRobot, physics: Physics) -> State:
+def placed(robot: MujocoRobot, physics: Physics) -> State:
     physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), physics)
     return robot.place(physics, jnp.zeros(len(physics.qpos)))
 
 
 def assert_commutes(
-    robot: MjxRobot,
+    robot: MujocoRobot,
     observed: Callable[[Physics, np.ndarray], np.ndarray],
     starts: Physics,
     episode: tuple[Any, ...],

@@ -14,8 +14,9 @@ from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from scipy.spatial.transform import Rotation
 
 from genidm import symmetry
+from genidm.engines import Physics
 from genidm.robots import Ant, State
-from genidm.robots.mjx import Physics, mirror_of
+from genidm.robots.mujoco import mirror_of
 from genidm.tasks import Lanes, Step, WalkForward
 
 LANES = 32

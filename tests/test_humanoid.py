@@ -13,9 +13,9 @@ from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from scipy.spatial.transform import Rotation
 
 from experiments.humanoid_world import in_world
+from genidm.engines import Physics
 from genidm.robots import Humanoid, HumanoidWorld
 from genidm.robots.humanoid import POWER
-from genidm.robots.mjx import Physics
 from genidm.tasks import WalkForward
 
 LANES = 16

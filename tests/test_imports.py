@@ -22,8 +22,11 @@ config
 files
 checkpoints progress
 store
-robots.base robots.bullet robots.pool
-robots.mjx
+engines.base engines.pool
+engines.mjx engines.mujoco engines.bullet
+engines
+robots.base robots.minitaur_world
+robots.mujoco
 robots.minitaur robots.ant robots.humanoid robots.logged
 robots.minitaur_env
 robots

@@ -23,15 +23,24 @@ from genidm import devices, symmetry
 from genidm.errors import BadInput
 from genidm.evaluate import Test, Testing, flatten
 from genidm.robots import Minitaur, State, by_name
-from genidm.robots.bullet import ALOFT, HOT, PATIENT, WIDTH, Engine, Simulation, parts, stepped
 from genidm.robots.minitaur import Physics, from_rows
+from genidm.robots.minitaur_world import (
+    ALOFT,
+    HOT,
+    PATIENT,
+    WIDTH,
+    Simulation,
+    Solver,
+    parts,
+    stepped,
+)
 from genidm.scenarios import scenarios
 from genidm.tasks import WalkForward
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no wheel of it here")
 
 LANES = 16
-AS_ORIGINAL = Engine(iterations=60, self_collision=True, cone=True)
+AS_ORIGINAL = Solver(iterations=60, self_collision=True, cone=True)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +70,7 @@ def rows(physics: Physics) -> np.ndarray:
     return np.concatenate([physics.pose, physics.motion, physics.motors], axis=-1)
 
 
-@pytest.fixture(scope="module", params=[Engine(), AS_ORIGINAL], ids=["ours", "original"])
+@pytest.fixture(scope="module", params=[Solver(), AS_ORIGINAL], ids=["ours", "original"])
 def simulation(request: Any) -> Iterator[Simulation]:
     simulation = Simulation(request.param)
     yield simulation

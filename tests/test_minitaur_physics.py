@@ -13,7 +13,7 @@ pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no w
 
 from experiments import minitaur_physics, minitaur_processes
 from experiments.minitaur_physics import OURS, OneByOne, gait, hard, live, placed, walk
-from genidm.robots.bullet import Simulation
+from genidm.robots.minitaur_world import Simulation
 
 
 def test_batched_calls_walk_as_one_call_a_joint_does() -> None:

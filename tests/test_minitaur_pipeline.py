@@ -79,7 +79,7 @@ def test_workers_that_are_killed_meanwhile_take_nothing_with_them(
     advance, shot = Progress.advance, []
 
     def shoot(self: Progress, *args: Any, **kwargs: Any) -> None:
-        for worker in list(robot._pool._idle.queue):
+        for worker in list(robot.engine.pool._idle.queue):
             if worker:
                 shot.append(worker.process.pid)
                 os.kill(worker.process.pid, signal.SIGKILL)
@@ -88,7 +88,7 @@ def test_workers_that_are_killed_meanwhile_take_nothing_with_them(
     monkeypatch.setattr(Progress, "advance", shoot)
     with pytest.warns(RuntimeWarning, match="another takes its place"):
         record = gathered(robot)
-    assert shot and robot._pool.replaced >= 3
+    assert shot and robot.engine.pool.replaced >= 3
     same(record, undisturbed)
 
 

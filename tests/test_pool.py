@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from genidm.robots.pool import MOST_ROWS, Pool, portions
+from genidm.engines.pool import MOST_ROWS, Pool, portions
 
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in.py"))]
 

@@ -24,7 +24,7 @@ from genidm.errors import BadInput
 from genidm.experiment import Options, guarded, run_cell
 from genidm.files import save_json
 from genidm.robots import Ant, HumanoidWorld, Logged, remade
-from genidm.robots.mjx import Solver
+from genidm.robots.mujoco import Solver
 from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.video import Film, Shot, Take, backends, clip, shooting

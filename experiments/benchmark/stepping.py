@@ -12,7 +12,7 @@ from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
 from genidm.robots import Robot, State
-from genidm.robots.mjx import MjxRobot
+from genidm.robots.mujoco import MujocoRobot
 
 # Steps of a lane in a call, as in an iteration of PPO.
 STEPS = 32
@@ -21,7 +21,7 @@ STEPS = 32
 def in_c(bench: Bench) -> Probe:
     """MuJoCo in C, one thread a core, on the robot's own model and solver settings."""
     robot, lanes = bench.robot, bench.options.lanes
-    if not isinstance(robot, MjxRobot):
+    if not isinstance(robot, MujocoRobot):
         raise Skip(f"the {robot.name} is no MuJoCo model")
     model, threads = robot.mj_model, devices.cores()
     pool = bench.exits.enter_context(Rollout(nthread=threads))

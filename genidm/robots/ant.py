@@ -7,22 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import symmetry
+from genidm.engines.base import Physics
 from genidm.robots.base import State
-from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
+from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver, load
 from genidm.symmetry import Layout
 
 # Metres; what the reset noise can lower a foot by (0.1 of height, 0.1 rad at the ankle).
 START_CLEARANCE = 0.15
 
 
-class Ant(MjxRobot):
-    """gymnasium's Ant on MJX.
+class Ant(MujocoRobot):
+    """gymnasium's Ant.
 
     s `[111]` is 13 of the 15 numbers of qpos (without x and y), the 14 of qvel, and the
     external wrench on each of the 14 bodies, the world counted, clipped to ±1: the layout
     of gymnasium's Ant up to version 4. Two numbers differ from gymnasium's, so that every
     field transforms exactly: quaternions have w ≥ 0, and a wrench's horizontal part is
     clipped by its length, not by its components along the world's axes.
+
+    Args:
+      solver: of the contacts.
+      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
     """
 
     name = "ant"
@@ -36,10 +41,10 @@ class Ant(MjxRobot):
     control_cost = 0.5
     contact_cost = 5e-4
 
-    def __init__(self, solver: Solver | None = None):
+    def __init__(self, solver: Solver | None = None, engine: str | None = None):
         solver = solver or Solver()
-        super().__init__(load(ASSETS / "ant.xml", solver), frames=5)
-        self.settings = {"name": self.name, "solver": solver}
+        super().__init__(load(ASSETS / "ant.xml", solver), 5, engine)
+        self.settings |= {"solver": solver}
         m = self.mirror
         self.observation = Layout(
             (

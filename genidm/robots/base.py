@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.sharding import Mesh
 
 from genidm import devices
+from genidm.engines.base import Engine
 from genidm.errors import BadInput
 from genidm.symmetry import Layout
 
@@ -54,6 +56,8 @@ class Robot(abc.ABC):
       target_distance: metres, least and greatest, of the paper's test (A.1.3).
       alive_bonus: reward of a step without a fall.
       paper_interactions: steps that the paper collects (A.1.2).
+      engines: names of the engines that can step it; none if it steps itself.
+      engine: the one that does; None if it steps itself.
       settings: its name, and what it was made with, argument by argument: they name run
         directories, and `genidm.robots.remade` makes the robot again from them.
     """
@@ -64,6 +68,8 @@ class Robot(abc.ABC):
     target_distance: ClassVar[tuple[float, float]]
     alive_bonus: ClassVar[float]
     paper_interactions: ClassVar[int]
+    engines: ClassVar[tuple[str, ...]] = ()
+    engine: Engine | None = None
     settings: dict[str, Any]
     observation: Layout
     physics: Any
@@ -110,11 +116,15 @@ class Robot(abc.ABC):
         return self.observation.canonical(jnp.asarray(s))
 
     def at_once(self, lanes: int) -> int:
-        """Robots to step at once for who asks for `lanes`, where no result depends on their number.
+        """Largest batch to step together for a caller that asks for `lanes`.
 
-        On an accelerator more, which few do not keep busy.
+        For callers whose results do not depend on the number.
         """
-        return devices.at_once(lanes)
+        return self.engine.at_once(lanes) if self.engine else devices.at_once(lanes)
+
+    def mesh(self) -> Mesh:
+        """The jax devices that share its lanes, unless the caller names others."""
+        return self.engine.mesh() if self.engine else devices.mesh()
 
     def drawing(self) -> mujoco.MjSpec:
         """A MuJoCo model that shows what the robot looks like, the caller's to change.

@@ -1,4 +1,4 @@
-"""The Humanoid: PyBullet's, on MJX; seventeen torques, a 43-D state (Table 1, A.1.1)."""
+"""The Humanoid: PyBullet's, in MuJoCo; seventeen torques, a 43-D state (Table 1, A.1.1)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 
 from genidm import symmetry
+from genidm.engines.base import Physics
 from genidm.robots.base import State
-from genidm.robots.mjx import ASSETS, MjxRobot, Physics, Solver, load
+from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver, load
 from genidm.symmetry import Layout
 
 Frame = Literal["heading", "world"]
@@ -38,8 +39,8 @@ BASE = np.array([-0.01, 0.0, -0.12])
 TOUCH = 1.0
 
 
-class Humanoid(MjxRobot):
-    """PyBullet's humanoid on MJX.
+class Humanoid(MujocoRobot):
+    """PyBullet's humanoid in MuJoCo.
 
     s `[43]` is PyBullet's state with the yaw itself in place of the direction to its target:
     height − 0.8 m, 0.3 × velocity, roll, pitch, yaw, then for each joint its angle between
@@ -47,6 +48,7 @@ class Humanoid(MjxRobot):
 
     Args:
       solver: of the contacts.
+      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
 
     Attributes:
       velocity: its frame in s. PyBullet turns it by the yaw, which takes from the LFM some of
@@ -66,10 +68,10 @@ class Humanoid(MjxRobot):
     torque_cost = 0.1
     limit_cost = 0.1
 
-    def __init__(self, solver: Solver | None = None):
+    def __init__(self, solver: Solver | None = None, engine: str | None = None):
         solver = solver or Solver()
-        super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), frames=4)
-        self.settings = {"name": self.name, "solver": solver}
+        super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), 4, engine)
+        self.settings |= {"solver": solver}
         limits = self.mj_model.jnt_range[1:]
         self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])

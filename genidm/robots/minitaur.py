@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from genidm import symmetry
+from genidm import engines, symmetry
+from genidm.engines.bullet import Bullet
 from genidm.errors import BadInput
-from genidm.robots import bullet
+from genidm.robots import minitaur_world as world
 from genidm.robots.base import Robot, State, select
-from genidm.robots.bullet import ROW, Engine
-from genidm.robots.pool import Pool
+from genidm.robots.minitaur_world import ROW, Solver
 from genidm.symmetry import Layout
 
 Observed = Literal["paper17", "native28"]
@@ -33,9 +33,6 @@ ACROSS = [5, 4, 7, 6, 1, 0, 3, 2]
 LEG_ACROSS = [2, 3, 0, 1]
 # Seconds that a worker may take for the robots it is given at once: a thousand times the usual.
 PATIENCE = 30.0
-# Robots a process that are stepped at once. The slowest process then takes all of a step's
-# time but for 2 %, with 16 robots 3 %, with 4 12 %; more gain nothing.
-KEEP_BUSY = 32
 
 ABSENT = (
     'the Minitaur needs PyBullet, which is not installed: `pip install "genidm[minitaur]"` brings'
@@ -45,7 +42,7 @@ ABSENT = (
 
 
 class Physics(flax.struct.PyTreeNode):
-    """All that a step in PyBullet depends on; `genidm.robots.bullet.ROW`, number by number.
+    """All that a step in PyBullet depends on; `genidm.robots.minitaur_world.ROW`, number by number.
 
     Attributes:
       pose: `[B, 23]`; base position (m) and quaternion, then joint angles (rad).
@@ -110,7 +107,8 @@ class Minitaur(Robot):
     has no inertia of its own. How far that takes it in a mirrored replay is in docs/physics.md.
 
     Args:
-      engine: settings of Bullet.
+      solver: settings of Bullet.
+      engine: "bullet"; there is no other.
       observed: s. "paper17": motor angles (8), the base's velocity (3) and spin (3) in the
         world frame, roll, pitch and yaw. "native28": that of pybullet_envs, motor angles,
         velocities and observed torques (8 each), and a quaternion, here as (w, x, y, z), w ≥ 0.
@@ -121,7 +119,7 @@ class Minitaur(Robot):
     """
 
     name = "minitaur"
-    control_step = bullet.SUBSTEP * bullet.SUBSTEPS
+    control_step = world.SUBSTEP * world.SUBSTEPS
     standing_height = 0.2
     target_distance = (1.5, 2.5)
     paper_interactions = 4_000_000
@@ -139,9 +137,13 @@ class Minitaur(Robot):
         )
     )
 
+    engines = ("bullet",)
+    engine: Bullet
+
     def __init__(
         self,
-        engine: Engine | None = None,
+        solver: Solver | None = None,
+        engine: str | None = None,
         observed: Observed = "paper17",
         processes: int | None = None,
     ):
@@ -149,39 +151,38 @@ class Minitaur(Robot):
             raise BadInput(ABSENT)
         if observed not in OBSERVATIONS:
             raise BadInput(f"observed is {' or '.join(OBSERVATIONS)}, not {observed!r}")
-        engine = engine or Engine()
-        self.settings = {"name": self.name, "engine": engine, "observed": observed}
+        solver = solver or Solver()
+        chosen = engines.choose(engine, self.engines, self.name)
+        self.settings = {
+            "name": self.name, "engine": chosen, "solver": solver, "observed": observed,
+        }  # fmt: skip
         self.observation = OBSERVATIONS[observed]
-        self._pool = pool(engine, processes)
+        self.engine = bullet(solver, processes)
 
     @functools.cached_property
     def _rest(self) -> Physics:
         """The settled start, `[...]` of one robot, at yaw 0."""
-        return from_rows(jnp.asarray(self._pool.greeting()))
+        return from_rows(jnp.asarray(self.engine.pool.greeting()))
 
     def drawing(self) -> mujoco.MjSpec:
         """PyBullet's own model, as MuJoCo reads it: its boxes and cylinders."""
         import pybullet_data
 
-        spec = mujoco.MjSpec.from_file(str(Path(pybullet_data.getDataPath()) / bullet.URDF))
+        spec = mujoco.MjSpec.from_file(str(Path(pybullet_data.getDataPath()) / world.URDF))
         spec.compiler.fusestatic = False  # the base is a body, and no part of the floor
         spec.bodies[1].add_freejoint()
         return spec
 
     def posture(self, physics: Physics) -> np.ndarray:
         pose = np.asarray(physics.pose)
-        angles = pose[..., 7:] * np.tile(bullet.DIRECTION, 2)
+        angles = pose[..., 7:] * np.tile(world.DIRECTION, 2)
         return np.concatenate([pose[..., :7], angles[..., self._drawn]], axis=-1)
 
     @functools.cached_property
     def _drawn(self) -> list[int]:
         """For each hinge of the drawing, which of our joints it is."""
-        model, names = self.drawing().compile(), bullet.MOTORS + bullet.KNEES
+        model, names = self.drawing().compile(), world.MOTORS + world.KNEES
         return [names.index(model.joint(i).name) for i in range(1, model.njnt)]
-
-    def at_once(self, lanes: int) -> int:
-        """No more than keep the processes busy: one whose episode is over costs a step, too."""
-        return min(lanes, KEEP_BUSY * self._pool.workers)
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
         """The settled start of pybullet_envs, the base given a slight push."""
@@ -200,19 +201,15 @@ class Minitaur(Robot):
 
     def step(self, state: State, action: jax.Array) -> State:
         before = state.physics
-        rows = jnp.concatenate([before.pose, before.motion, before.motors, action], axis=-1)
-        size = jax.ShapeDtypeStruct((len(rows), bullet.WIDTH), jnp.float32)
-        after = jax.pure_callback(self._step_rows, size, rows.astype(jnp.float32))
+        rows = jnp.concatenate([before.pose, before.motion, before.motors], axis=-1)
+        after = self.engine.step(rows, action).physics
         finite = jnp.isfinite(after).all(-1)
-        then = self._state(from_rows(after.astype(rows.dtype)))
+        then = self._state(from_rows(after))
         return select(finite, then, state.replace(diverged=jnp.ones_like(finite)))
-
-    def _step_rows(self, rows: jax.Array) -> np.ndarray:
-        return self._pool.map(np.asarray(rows))
 
     def _state(self, physics: Physics) -> State:
         orientation = POSE.part(physics.pose, "orientation")
-        fallen = bullet.has_fallen(orientation, physics.pose[:, 2])
+        fallen = world.has_fallen(orientation, physics.pose[:, 2])
         return State(
             physics=physics,
             observation=self._observe(physics),
@@ -233,7 +230,7 @@ class Minitaur(Robot):
         """What pybullet_envs charges for energy, a second."""
         torque = MOTORS.part(state.physics.motors, "torque")
         rate = MOTION.part(state.physics.motion, "motor velocities")
-        return bullet.charge(torque, rate) / self.control_step
+        return world.charge(torque, rate) / self.control_step
 
 
 def from_rows(rows: jax.Array) -> Physics:
@@ -244,13 +241,13 @@ def from_rows(rows: jax.Array) -> Physics:
 
 
 @functools.cache
-def pool(engine: Engine, processes: int | None) -> Pool:
-    """The processes that step robots under these settings, shared by all who ask for them."""
-    settings = json.dumps(dataclasses.asdict(engine))
+def bullet(solver: Solver, processes: int | None) -> Bullet:
+    """The processes that step robots under these settings, shared by all that ask for them."""
+    settings = json.dumps(dataclasses.asdict(solver))
     # -P: the worker's own directory is no place to import from.
-    command = [sys.executable, "-P", bullet.__file__, settings, str(PATIENCE)]
-    made = Pool(command, bullet.WIDTH, processes, PATIENCE)
-    atexit.register(made.close)
+    command = [sys.executable, "-P", world.__file__, settings, str(PATIENCE)]
+    made = Bullet(command, world.WIDTH, processes, PATIENCE)
+    atexit.register(made.pool.close)
     return made
 
 

@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-from genidm.robots.bullet import ACTIONS, Engine, Simulation, charge, has_fallen, parts
 from genidm.robots.minitaur import OBSERVATIONS, Observed
+from genidm.robots.minitaur_world import ACTIONS, Simulation, Solver, charge, has_fallen, parts
 
 
 class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -24,12 +24,12 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     contacts that Bullet keeps from one step to the next: nothing is placed anew here.
 
     Args:
-      engine: settings of Bullet.
+      solver: settings of Bullet.
       observed: s, "paper17" or "native28".
     """
 
-    def __init__(self, engine: Engine | None = None, observed: Observed = "paper17"):
-        self.simulation = Simulation(engine)
+    def __init__(self, solver: Solver | None = None, observed: Observed = "paper17"):
+        self.simulation = Simulation(solver)
         self._observed = observed
         size = OBSERVATIONS[observed].size
         self.observation_space = Box(-np.inf, np.inf, (size,), np.float32)
@@ -43,7 +43,7 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Args:
           seed: has no effect: all starts are alike.
           options: "yaw", radians, that the start faces (0); or "row" `[61]`, a state to be
-            placed in (`genidm.robots.bullet.ROW`).
+            placed in (`genidm.robots.minitaur_world.ROW`).
         """
         super().reset(seed=seed)
         options = options or {}

@@ -1,39 +1,23 @@
-"""What robots on MuJoCo's MJX share: stepping, resets, and the mirror image of a model."""
+"""What robots with a MuJoCo model share: resets, states, and the mirror image of a model."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import brax
-import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from etils import epath
-from mujoco import mjx
 
-from genidm import symmetry
+from genidm import engines, symmetry
+from genidm.engines.base import Engine, Physics
 from genidm.robots.base import Robot, State, select
 from genidm.symmetry import Layout
 
 ASSETS = epath.Path(brax.__file__).parent / "envs" / "assets"
-
-
-class Physics(flax.struct.PyTreeNode):
-    """All of `mjx.Data` that a step depends on; the rest is rebuilt from a template.
-
-    Attributes:
-      qpos: `[B, nq]`; base position (m) and quaternion, then joint angles (rad).
-      qvel: `[B, nv]`; base velocity (m/s, rad/s), then joint velocities (rad/s).
-      warmstart: `[B, nv]`; accelerations that the constraint solver starts from.
-    """
-
-    qpos: Any
-    qvel: Any
-    warmstart: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +99,8 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
     return Mirror(bodies, hinges, signs, actuators, [signs[j] for j in driven])
 
 
-class MjxRobot(Robot):
-    """A robot with a free base on hinges, stepped by MJX.
+class MujocoRobot(Robot):
+    """A robot with a free base on hinges, stepped by MJX or by MuJoCo in C.
 
     Subclasses name the constants of the contract and `healthy_height`, and give
     `_observe` and `cost`.
@@ -124,17 +108,22 @@ class MjxRobot(Robot):
     Args:
       spec: the model.
       frames: physics steps a control step.
+      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
     """
 
+    engines = ("mjx", "mujoco")
+    engine: Engine
     healthy_height: tuple[float, float]
     reset_noise: float = 0.1
 
-    def __init__(self, spec: mujoco.MjSpec, frames: int):
+    def __init__(self, spec: mujoco.MjSpec, frames: int, engine: str | None):
         self._spec = spec
         self.mj_model = spec.compile()
         self.frames = frames
-        self._model = mjx.put_model(self.mj_model, impl="jax")
-        self._template = mjx.make_data(self.mj_model, impl="jax")
+        self.engine = engines.of_model(
+            engines.choose(engine, self.engines, self.name), spec, frames
+        )
+        self.settings = {"name": self.name, "engine": self.engine.name}
         self._rest = self.rest_pose()
         self.mirror = mirror_of(self.mj_model)
         self.physics = self._physics_layout()
@@ -184,7 +173,7 @@ class MjxRobot(Robot):
         return state.replace(fallen=jnp.zeros_like(state.fallen))
 
     def step(self, state: State, action: jax.Array) -> State:
-        physics, contact = jax.vmap(self._advance)(state.physics, action)
+        physics, contact = self.engine.step(state.physics, action)
         finite = functools.reduce(
             jnp.logical_and,
             [
@@ -194,18 +183,6 @@ class MjxRobot(Robot):
         )
         after = jax.vmap(self._state)(physics, contact)
         return select(finite, after, state.replace(diverged=jnp.ones_like(finite)))
-
-    def _advance(self, physics: Physics, action: jax.Array) -> tuple[Physics, jax.Array]:
-        """One robot, one control step: new physics and contact wrenches `[nbody, 6]`."""
-        data = self._template.replace(
-            qpos=physics.qpos,
-            qvel=physics.qvel,
-            qacc_warmstart=physics.warmstart,
-            ctrl=jnp.clip(action, -1.0, 1.0),
-        )
-        data = jax.lax.fori_loop(0, self.frames, lambda _, d: mjx.step(self._model, d), data)
-        contact = mjx.rne_postconstraint(self._model, data)._impl.cfrc_ext
-        return Physics(data.qpos, data.qvel, data.qacc_warmstart), contact
 
     def _state(self, physics: Physics, contact: jax.Array) -> State:
         height = physics.qpos[2]

@@ -82,7 +82,7 @@ REST = np.repeat([MOTOR_START, KNEE_START], 8)
 
 
 @dataclasses.dataclass(frozen=True)
-class Engine:
+class Solver:
     """Settings of Bullet, chosen by measuring (docs/physics.md).
 
     Attributes:
@@ -186,18 +186,18 @@ class Simulation:
     It starts anew by `reset`, which loads everything afresh, or by `place`, in any state.
 
     Args:
-      engine: settings of Bullet.
+      solver: settings of Bullet.
 
     Raises:
       ImportError: PyBullet is not installed.
     """
 
-    def __init__(self, engine: Engine | None = None):
+    def __init__(self, solver: Solver | None = None):
         with silence():
             import pybullet
 
             server = pybullet.connect(pybullet.DIRECT)
-        self.engine = engine or Engine()
+        self.solver = solver or Solver()
         self.bullet: Any = Client(pybullet, server)
         self._end = weakref.finalize(self, pybullet.disconnect, server)
         self.reset()
@@ -213,9 +213,9 @@ class Simulation:
     def _load(self, yaw: float) -> None:
         import pybullet_data
 
-        bullet, engine = self.bullet, self.engine
+        bullet, solver = self.bullet, self.solver
         bullet.setPhysicsEngineParameter(
-            numSolverIterations=engine.iterations, enableConeFriction=int(engine.cone),
+            numSolverIterations=solver.iterations, enableConeFriction=int(solver.cone),
             # The order of contacts is that of the robot's links, not of what came before.
             deterministicOverlappingPairs=1,
         )  # fmt: skip
@@ -223,7 +223,7 @@ class Simulation:
         bullet.setGravity(0, 0, GRAVITY)
         bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
         bullet.loadURDF("plane.urdf")
-        flags = bullet.URDF_USE_SELF_COLLISION if engine.self_collision else 0
+        flags = bullet.URDF_USE_SELF_COLLISION if solver.self_collision else 0
         upright = bullet.getQuaternionFromEuler([0, 0, yaw])
         self.body = bullet.loadURDF(URDF, [0, 0, START_HEIGHT], upright, flags=flags)
         self._find_joints()
@@ -315,7 +315,7 @@ class Simulation:
 # ── a worker ────────────────────────────────────────────────────────────────────────────────
 
 
-def serve(engine: Engine, patience: float) -> None:
+def serve(solver: Solver, patience: float) -> None:
     """Steps robots that come on stdin until nobody is left to send any.
 
     First the settled start goes out, a row `[61]`. Then each request is an int32 n and n rows
@@ -323,14 +323,14 @@ def serve(engine: Engine, patience: float) -> None:
     float32.
 
     Args:
-      engine: settings of Bullet.
+      solver: settings of Bullet.
       patience: seconds for a request; the kernel ends a worker that takes longer.
     """
     source, sink = os.dup(0), os.dup(1)
     os.dup2(2, 1)  # what Bullet may have to say
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who sends
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    simulation, parent = Simulation(engine), os.getppid()
+    simulation, parent = Simulation(solver), os.getppid()
     send(sink, simulation.read())
     while (count := receive(source, 1, np.int32, parent)) is not None:
         signal.setitimer(signal.ITIMER_REAL, patience)
@@ -379,4 +379,4 @@ def receive(source: int, count: int, kind: Any, parent: int) -> np.ndarray | Non
 
 if __name__ == "__main__":
     given, seconds = sys.argv[1:]
-    serve(Engine(**json.loads(given)), float(seconds))
+    serve(Solver(**json.loads(given)), float(seconds))
