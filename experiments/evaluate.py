@@ -19,6 +19,7 @@ def main(
     seeds: int = 10,
     episodes: int = 1000,
     first_seed: int = 0,
+    engine: str | None = None,
     test: Test = Test(),  # noqa: B008
 ) -> None:
     """The paper's test (A.1.3) of controllers, on as many scenarios as you like; keeps nothing.
@@ -28,12 +29,13 @@ def main(
       seeds: test seeds.
       episodes: episodes a seed.
       first_seed: the first of the test seeds; another one gives unseen scenarios.
+      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
       test: settings of the test.
 
     Raises:
       BadInput: runs of different robots, or none.
     """
-    robot, models = saved(runs)
+    robot, models = saved(runs, engine)
     bank = scenarios(robot, seeds, episodes, first_seed)
     rows = [
         Row(
@@ -46,7 +48,12 @@ def main(
         for name, (model, fitted) in models.items()
     ]
     written = results(
-        rows, robot=robot.name, scale="test", scenarios=bank.digest(), environment=environment()
+        rows,
+        robot=robot.name,
+        engine=robot.engine,
+        scale="test",
+        scenarios=bank.digest(),
+        environment=environment(),
     )
     print(text(written))
 

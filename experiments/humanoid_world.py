@@ -38,7 +38,9 @@ def in_world(s: np.ndarray) -> np.ndarray:
 def record(options: table1.Table) -> Experience:
     """The Humanoid's record in the place of HumanoidWorld's; collected, unless it is there."""
     lr = by_name("LR", Humanoid.name)
-    source, target = (cell(robot, lr, options) for robot in (Humanoid(), HumanoidWorld()))
+    source, target = (
+        cell(robot(engine=options.engine), lr, options) for robot in (Humanoid, HumanoidWorld)
+    )
     assert isinstance(source, InverseCell) and isinstance(target, InverseCell)
     stage = target.experience_stage
 

@@ -13,7 +13,7 @@ from genidm.cells import InverseCell
 from genidm.config import environment, plain
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.experiment import Options, bank_of, cell, film_cell, guarded
+from genidm.experiment import Options, announced, bank_of, cell, film_cell, guarded
 from genidm.methods import LR, Inverse
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
@@ -144,7 +144,8 @@ def metres(value: float | None) -> str:
 
 def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> None:
     """Fits, tests, and prints the numbers."""
-    print((run(by_name(options.robot), LR, options) / "table.txt").read_text())
+    robot = announced(by_name(options.robot, options.engine), options.engine)
+    print((run(robot, LR, options) / "table.txt").read_text())
 
 
 if __name__ == "__main__":

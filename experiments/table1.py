@@ -14,7 +14,15 @@ import tyro
 
 from genidm.cells import Cell
 from genidm.errors import BadInput
-from genidm.experiment import Options, bank_of, cell, film_cell, guarded, write_report
+from genidm.experiment import (
+    Options,
+    announced,
+    bank_of,
+    cell,
+    film_cell,
+    guarded,
+    write_report,
+)  # fmt: skip
 from genidm.methods import EXTRA, ORDER, Direct, Inverse, by_name
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
@@ -136,7 +144,9 @@ def attempt(item: Work) -> Exception | None:
 
 def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
     """Runs the cells and prints the table; a cell that failed shows in the exit status."""
-    report, failures = run(robot_by_name(options.robot), chosen(options), options)
+    methods = chosen(options)
+    robot = announced(robot_by_name(options.robot, options.engine), options.engine)
+    report, failures = run(robot, methods, options)
     if report:
         print((report / "table.txt").read_text())
     if failures:

@@ -13,12 +13,15 @@ from genidm.evaluate import walking_speed
 from genidm.experiment import guarded
 
 
-def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> None:
+def main(
+    root: Annotated[Path, tyro.conf.Positional], episodes: int = 100, engine: str | None = None
+) -> None:
     """Forward speed of the last policy of every agent that collected under `root`.
 
     Args:
       root: the directory of a robot's stages.
       episodes: episodes of 1000 steps, or up to a fall.
+      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
 
     Raises:
       BadInput: there is none.
@@ -27,7 +30,7 @@ def main(root: Annotated[Path, tyro.conf.Positional], episodes: int = 100) -> No
     if not policies:
         raise BadInput(f"no agent has collected under {root}: it is to be as runs/ant is")
     for path in policies:
-        policy = controller.load(path)
+        policy = controller.load(path, engine=engine)
         speed = walking_speed(policy.robot, policy, episodes)
         name = path.parent.name
         print(f"{name}: {speed.mean():.2f} m/s, {speed.std():.2f} between episodes")

@@ -28,6 +28,7 @@ def main(
     robots: int = 10,
     yaw: float = 0.0,
     seed: int = 0,
+    engine: str | None = None,
     out: Path = Path("runs/waypoints"),
     settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),  # noqa: B008
 ) -> None:
@@ -39,13 +40,14 @@ def main(
       robots: journeys of each controller.
       yaw: radians, that the starts are turned by.
       seed: of the starts.
+      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
       out: directory that gets the figure and the numbers.
       settings: of a journey.
 
     Raises:
       BadInput: runs of different robots, or none; waypoints that are none.
     """
-    robot, models = saved(runs)
+    robot, models = saved(runs, engine)
     if robots < 1:
         raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
@@ -54,7 +56,12 @@ def main(
         made[name] = follow(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}
-    written = {"waypoints": points, "methods": jsonable(summary, digits=4), **environment()}
+    written = {
+        "waypoints": points,
+        "engine": str(robot.engine),
+        "methods": jsonable(summary, digits=4),
+        **environment(),
+    }
     name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", written)
     journeys(made, settings.reach, out / f"{name}.png")

@@ -101,7 +101,10 @@ class Cell(abc.ABC, Generic[M]):
           kind: first word of the stage's name. The report shows all of kind "test"; those
             of another kind are no rows of its table.
         """
-        config = dict(fit=self.controller_stage.directory.name, bank=bank.digest(), test=self.test)
+        config = dict(
+            robot=self.robot.settings, fit=self.controller_stage.directory.name,
+            bank=bank.digest(), test=self.test,
+        )  # fmt: skip
         stage = Stage.open(self.root, f"{kind}-{self._label}", config)
         stage.once(lambda: self._tested(stage, bank))
         return stage
@@ -117,6 +120,7 @@ class Cell(abc.ABC, Generic[M]):
         return (
             self.controller_stage.summary()
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
+            | {"engine": self.robot.engine and self.robot.engine.name}
             | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
         )
 

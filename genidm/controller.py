@@ -120,7 +120,7 @@ def pretrained(robot: str) -> Controller | Policy:
     return load(PRETRAINED / robot)
 
 
-def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
+def load(path: Path, robot: Robot | None = None, engine: str | None = None) -> Controller | Policy:
     """A saved controller, fitted or learned.
 
     Args:
@@ -128,6 +128,7 @@ def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
         (METHOD-SEED-…) that it lies in.
       robot: whose controller it is; found by its name among those that come with genidm,
         unless given.
+      engine: to step that robot with, where none is given; the robot chooses, unless given.
 
     Raises:
       BadInput: the directory is torn, or the controller is another robot's.
@@ -142,7 +143,7 @@ def load(path: Path, robot: Robot | None = None) -> Controller | Policy:
     tree, meta = files.load_arrays(place)
     if tree.keys() != {"params", "mean", "std"}:
         raise BadInput(f"{path} holds no controller")
-    robot = robot or by_name(meta["robot"])
+    robot = robot or by_name(meta["robot"], engine)
     if meta["robot"] != robot.name:
         raise BadInput(f"{path} holds a controller for {meta['robot']}, not for {robot.name}")
     restore = Policy.restore if "directed" in meta else Controller.restore

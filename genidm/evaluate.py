@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -22,6 +22,7 @@ from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
+from genidm.rollout import Move, rollout
 from genidm.scenarios import Scenarios
 from genidm.store import Stage
 from genidm.symmetry import horizontal
@@ -66,26 +67,48 @@ class Outcome(flax.struct.PyTreeNode):
     path_length: jax.Array
 
 
-class Queue(flax.struct.PyTreeNode):
-    """One device's share: its lanes `[L]`, its scenarios `[n]`, its results `[n]`.
+class Running(flax.struct.PyTreeNode):
+    """The lanes `[L]` of one device.
 
     Attributes:
       robots: State `[L]`.
       target: `[L, 3]`.
-      episode: `[L]` int32, which of the n the lane is at; n when it has none.
+      episode: `[L]` int32, which of the device's n episodes the lane is at; n when it has none.
       now: Outcome `[L]` of the running episodes.
-      ended: Outcome `[n]` of the ended ones.
-      taken: `[1]` int32, scenarios handed out.
-      ways: `[m, max_steps + 1, 3]`, positions in the first m episodes, which are traced.
+      taken: `[1]` int32, episodes handed out.
     """
 
     robots: State
     target: jax.Array
     episode: jax.Array
     now: Outcome
-    ended: Outcome
     taken: jax.Array
+
+
+class Queue(flax.struct.PyTreeNode):
+    """One device's share of the test: its lanes, and the results of its n episodes.
+
+    Attributes:
+      running: the lanes.
+      ended: Outcome `[n]` of the episodes that have ended.
+      ways: `[m, max_steps + 1, 3]`, positions in the first m episodes, which are traced.
+    """
+
+    running: Running
+    ended: Outcome
     ways: jax.Array
+
+
+class Share(NamedTuple):
+    """The episodes of one device's queue.
+
+    Attributes:
+      robots: State `[n]` at their starts.
+      target: `[n, 3]`, metres.
+    """
+
+    robots: State
+    target: jax.Array
 
 
 def evaluate(
@@ -168,7 +191,7 @@ def run(
     testing = Testing(robot, bank, settings or Test(), mesh or robot.mesh(), traced)
     queue, calls = testing.start(), 0
     # Its queues belong to the devices: on others the test begins anew.
-    here = f"{testing.mesh.size}_devices_{queue.episode.size}_lanes"
+    here = f"{testing.mesh.size}_devices_{queue.running.episode.size}_lanes"
     checkpoints = stage.checkpoints(here) if stage else None
     found = checkpoints.latest(queue) if checkpoints else None
     if found:
@@ -241,21 +264,21 @@ class Testing:
         shapes = jax.eval_shape(
             self.robot.reset, jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes)
         )
-        queue = Queue(
+        running = Running(
             robots=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
             target=jnp.zeros((lanes, 3)),
             episode=jnp.full(lanes, share, jnp.int32),
             now=_nothing(lanes),
-            ended=_nothing(share * count),
             taken=jnp.zeros(count, jnp.int32),
-            ways=jnp.zeros((rows, self.settings.max_steps + 1, 3)),
         )
+        ways = jnp.zeros((rows, self.settings.max_steps + 1, 3))
+        queue = Queue(running, _nothing(share * count), ways)
         return devices.put(queue, self.mesh)
 
     def prepare(self, controller: Steering, queue: Queue) -> Callable[[Queue], Queue]:
         """The compiled program of `settings.chunk` steps of every lane; it donates the queue."""
         controller = devices.put(controller, self.mesh, None)
-        shares = devices.put(self._dealt(), self.mesh)
+        shares = self._shares()
         body = functools.partial(_chunk, self.robot, self.settings)
         sharded = devices.over_lanes(body, self.mesh, [None, 0, 0], 0)
         jitted = jax.jit(sharded, donate_argnums=1)
@@ -269,7 +292,7 @@ class Testing:
     def useful(self, queue: Queue, calls: int) -> float:
         """Share of the lane-steps of so many calls that were spent in episodes."""
         steps = np.asarray(queue.ended.steps).sum() + self._under_way(queue).sum()
-        return float(steps / (calls * self.settings.chunk * queue.episode.shape[0]))
+        return float(steps / (calls * self.settings.chunk * queue.running.episode.shape[0]))
 
     def longest(self, queue: Queue) -> int:
         """Steps of the longest episode under way; until it ends there may be none to count."""
@@ -277,7 +300,7 @@ class Testing:
 
     def _under_way(self, queue: Queue) -> np.ndarray:
         """Steps `[lanes]` of the episode that each lane is at; 0 for one that has none."""
-        return np.where(np.asarray(queue.episode) < self.share, queue.now.steps, 0)
+        return np.where(np.asarray(queue.running.episode) < self.share, queue.running.now.steps, 0)
 
     def outcome(self, queue: Queue) -> Outcome:
         """Outcomes `[N]`, in the order of the bank."""
@@ -288,12 +311,14 @@ class Testing:
         steps, ways = self._in_order(queue.ended.steps), self._in_order(queue.ways)
         return [ways[i, : steps[i] + 1] for i in range(self.traced)]
 
-    def _dealt(self) -> Scenarios:
-        """Scenarios `[devices × n]`, dealt out to the devices in turn, short shares filled up."""
+    def _shares(self) -> Share:
+        """Episodes `[devices × n]`, dealt out to the devices in turn, short shares filled up."""
         count, share = self.mesh.size, self.share
         dealt = np.minimum(np.arange(share * count), self.total - 1)
         dealt = dealt.reshape(share, count).T.reshape(-1)
-        return jax.tree.map(lambda x: x[dealt], self.bank)
+        bank = devices.put(jax.tree.map(lambda x: x[dealt], self.bank), self.mesh)
+        start = jax.jit(devices.over_lanes(self.robot.reset, self.mesh, [0, 0], 0))
+        return Share(start(bank.keys, bank.yaw), bank.target)
 
     def _in_order(self, x: jax.Array) -> np.ndarray:
         """Undoes the dealing out: `[devices × n, ...]` in the order of the bank."""
@@ -311,69 +336,88 @@ def _nothing(count: int) -> Outcome:
     )
 
 
+class _Seen(NamedTuple):
+    """What a step of L lanes leaves to be written down.
+
+    Attributes:
+      episode: `[L]`, which of the n episodes the lane was at; n if at none.
+      over: `[L]` bool, it has ended.
+      now: its Outcome `[L]` so far.
+      position: `[L, 3]` after the step.
+    """
+
+    episode: jax.Array
+    over: jax.Array
+    now: Outcome
+    position: jax.Array
+
+
 def _chunk(
-    robot: Robot, settings: Test, controller: Steering, queue: Queue, shares: Scenarios
+    robot: Robot, settings: Test, controller: Steering, queue: Queue, shares: Share
 ) -> Queue:
-    """`settings.chunk` steps of one device's lanes."""
+    """`settings.chunk` steps of one device's lanes, then what they leave is written down."""
 
-    def step(queue: Queue, _: None) -> tuple[Queue, None]:
-        queue = _take(robot, queue, shares)
-        return _step(robot, settings, controller, queue), None
+    def act(lanes: Running, _: None) -> tuple[State, jax.Array, Running]:
+        lanes = _take(lanes, shares)
+        o = lanes.robots.position
+        return lanes.robots, controller(lanes.robots.observation, lanes.target - o), lanes
 
-    queue, _ = jax.lax.scan(step, queue, length=settings.chunk)
-    return queue
+    def watch(_: Running, move: Move) -> tuple[Running, _Seen]:
+        lanes: Running = move.notes
+        now = _observe(lanes.now, move, lanes.target, settings.reach)
+        over = now.reached | now.fell | now.diverged | (now.steps >= settings.max_steps)
+        over &= lanes.episode < len(shares.target)
+        seen = _Seen(lanes.episode, over, now, move.after.position)
+        idle = jnp.where(over, len(shares.target), lanes.episode)
+        return lanes.replace(robots=move.after, episode=idle, now=now), seen
+
+    running, seen = rollout(robot, act, watch, queue.running, steps=settings.chunk)
+    return _written(queue.replace(running=running), seen, shares)
 
 
-def _take(robot: Robot, queue: Queue, shares: Scenarios) -> Queue:
-    """Idle lanes take the next scenarios of the queue, while there are any."""
-    total = shares.yaw.shape[0]
-    idle = queue.episode >= total
-    rank = queue.taken + jnp.cumsum(idle) - 1
+def _take(lanes: Running, shares: Share) -> Running:
+    """Idle lanes take the next episodes of the queue, while there are any."""
+    total = len(shares.target)
+    idle = lanes.episode >= total
+    rank = lanes.taken + jnp.cumsum(idle) - 1
     takes = idle & (rank < total)
-    episode = jnp.where(takes, rank, queue.episode).astype(jnp.int32)
+    episode = jnp.where(takes, rank, lanes.episode).astype(jnp.int32)
     new = jax.tree.map(lambda x: x[jnp.minimum(episode, total - 1)], shares)
-    robots = robot.reset(new.keys, new.yaw)
-    distance = horizontal(new.target - robots.position)
+    distance = horizontal(new.target - new.robots.position)
     fresh = _nothing(episode.shape[0]).replace(closest=distance, start=distance)
-    slot = jnp.where(takes, episode, total)
-    return queue.replace(
-        robots=select(takes, robots, queue.robots),
-        target=select(takes, new.target, queue.target),
+    return Running(
+        robots=select(takes, new.robots, lanes.robots),
+        target=select(takes, new.target, lanes.target),
         episode=episode,
-        now=select(takes, fresh, queue.now),
-        taken=queue.taken + takes.sum(),
-        ways=queue.ways.at[slot, 0].set(robots.position, mode="drop"),
+        now=select(takes, fresh, lanes.now),
+        taken=lanes.taken + takes.sum(),
     )
 
 
-def _step(robot: Robot, settings: Test, controller: Steering, queue: Queue) -> Queue:
-    """One step of every lane; what ended is written down, and its lane is idle."""
-    before = queue.robots
-    action = controller(before.observation, queue.target - before.position)
-    after = robot.step(before, action)
-    now = _observe(queue.now, before, after, queue.target, settings.reach)
-    total = queue.ended.steps.shape[0]
-    over = now.reached | now.fell | now.diverged | (now.steps >= settings.max_steps)
-    over &= queue.episode < total
-    slot = jnp.where(over, queue.episode, total)
-    return queue.replace(
-        robots=after,
-        now=now,
-        ended=jax.tree.map(lambda kept, x: kept.at[slot].set(x, mode="drop"), queue.ended, now),
-        episode=jnp.where(over, total, queue.episode),
-        ways=queue.ways.at[queue.episode, now.steps].set(after.position, mode="drop"),
-    )
-
-
-def _observe(now: Outcome, before: State, after: State, target: jax.Array, reach: float) -> Outcome:
+def _observe(now: Outcome, move: Move, target: jax.Array, reach: float) -> Outcome:
     """The outcomes so far, with one more step in them."""
-    distance = horizontal(target - after.position)
+    o, o_next = move.before.position, move.after.position
+    distance = horizontal(target - o_next)
     return Outcome(
         closest=jnp.minimum(now.closest, distance),
         start=now.start,
         reached=distance <= reach,
-        fell=after.fallen,
-        diverged=after.diverged,
+        fell=move.after.fallen,
+        diverged=move.after.diverged,
         steps=now.steps + 1,
-        path_length=now.path_length + horizontal(after.position - before.position),
+        path_length=now.path_length + horizontal(o_next - o),
     )
+
+
+def _written(queue: Queue, seen: _Seen, shares: Share) -> Queue:
+    """The queue with what some steps `[T, L]` have left: results and ways."""
+    total = len(shares.target)
+    slot = jnp.where(seen.over, seen.episode, total)
+
+    def keep(kept: jax.Array, x: jax.Array) -> jax.Array:
+        return kept.at[slot].set(x, mode="drop")
+
+    ways = queue.ways.at[seen.episode, seen.now.steps].set(seen.position, mode="drop")
+    traced = min(len(ways), total)
+    ways = ways.at[:traced, 0].set(shares.robots.position[:traced])
+    return queue.replace(ended=jax.tree.map(keep, queue.ended, seen.now), ways=ways)

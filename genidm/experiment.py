@@ -19,7 +19,7 @@ from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test
 from genidm.methods import Direct, Inverse, literal
-from genidm.robots import Robot
+from genidm.robots import Robot, by_name
 from genidm.scale import Scale, scale_of
 from genidm.scenarios import Scenarios, scenarios
 from genidm.store import Stage
@@ -33,6 +33,8 @@ class Options:
       scale: "paper" (A.1.2: all interactions, 10 seeds × 1000 episodes), "quick" (minutes),
         or a number: that share of the paper's interactions, updates and episodes.
       seed: training seed: of the experience, the replay and the fit. The test's are fixed.
+      engine: what steps the robot: "mjx", or "mujoco" for MuJoCo in C; MJX on an accelerator
+        and MuJoCo in C on a CPU, unless given. The Minitaur has "bullet" alone.
       out: where runs are kept. The same command again goes on where it was.
       literal: the paper's letter instead of our settings: h = 1, whole-episode replay,
         λ = 0.25, mean latents, constant learning rate.
@@ -44,6 +46,7 @@ class Options:
 
     scale: str = "paper"
     seed: int = 0
+    engine: str | None = None
     out: Path = Path("runs")
     literal: bool = False
     episodes: int | None = None
@@ -103,8 +106,14 @@ def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
     return write_report(this, tested, options)
 
 
-def saved(runs: Sequence[Path]) -> tuple[Robot, dict[str, tuple[Steering, dict[str, Any]]]]:
+def saved(
+    runs: Sequence[Path], engine: str | None = None
+) -> tuple[Robot, dict[str, tuple[Steering, dict[str, Any]]]]:
     """Controllers to be compared, from the directories of their runs.
+
+    Args:
+      runs: the directories.
+      engine: to step their robot with; chosen by what jax runs on, unless given.
 
     Returns:
       their robot; and by the method's name, or where two runs have the same also the run's,
@@ -118,13 +127,14 @@ def saved(runs: Sequence[Path]) -> tuple[Robot, dict[str, tuple[Steering, dict[s
     robots: dict[str, Robot] = {}
     models: dict[str, tuple[Steering, dict[str, Any]]] = {}
     for run in runs:
-        summary, model = Stage(run).summary(), controller.load(run)
-        name = summary["method"]
+        summary = Stage(run).summary()
+        robot, name = summary["robot"], summary["method"]
+        robots.setdefault(robot, by_name(robot, engine))
+        model = controller.load(run, robots[robot])
         models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
-        robots.setdefault(model.robot.name, model.robot)
     if len(robots) > 1:
         raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")
-    return next(iter(robots.values())), models
+    return announced(next(iter(robots.values())), engine), models
 
 
 def film_cell(this: Cell[Any]) -> None:
@@ -160,14 +170,26 @@ def write_report(this: Cell[Any], bank: Scenarios, options: Options) -> Path:
     return report(this.robot, this.root, bank, this.scale.name, options.test, options.results)
 
 
-def main(robot: Callable[[], Robot], method: Direct | Inverse) -> None:
+def announced(robot: Robot, engine: str | None) -> Robot:
+    """The robot, once it is said on stderr what steps it and, if nobody chose that, why."""
+    if robot.engine:
+        where = "an accelerator" if devices.memory() else "no accelerator"
+        others = " or ".join(name for name in robot.engines if name != robot.engine.name)
+        why = f": jax has {where}; --engine {others} instead" if engine is None and others else ""
+        print(f"{robot.name} on {robot.engine}{why}", file=sys.stderr)
+    return robot
+
+
+def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
     """The command line of a cell: `python -m experiments.ant_lr`."""
 
     def command(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
         method: Direct | Inverse = method,
     ) -> None:
-        print((run_cell(robot(), method, options) / "table.txt").read_text())
+        with_engine = {} if options.engine is None else {"engine": options.engine}
+        made = announced(robot(**with_engine), options.engine)
+        print((run_cell(made, method, options) / "table.txt").read_text())
 
     guarded(command, f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end.")
 

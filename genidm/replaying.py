@@ -18,6 +18,7 @@ from genidm import devices, files
 from genidm.experience import Experience
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
+from genidm.rollout import Move, rollout
 
 
 class Replay(flax.struct.PyTreeNode):
@@ -191,19 +192,22 @@ class Runner:
         return outputs
 
     def _replay(self, cursor: Cursor, block: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
-        return jax.lax.scan(self._step, cursor, block)
+        return rollout(self.robot, self._act, self._watch, cursor, block)
 
-    def _step(self, cursor: Cursor, row: Block) -> tuple[Cursor, tuple[jax.Array, ...]]:
-        """One step of B lanes: placed on the record where it says so, then replayed."""
+    def _act(self, cursor: Cursor, row: Block) -> tuple[State, jax.Array, tuple[Any, ...]]:
+        """B robots, placed on the record where it says so, and the record's actions."""
         placed = row["placed"]
         keys, yaw = _draw_yaw(cursor.keys)
         yaw = jnp.where(placed, yaw, cursor.yaw)
         on_record = self.robot.place(row["physics"], yaw)
         # The record knows readings that `place` cannot (contact): turned, they are exact.
         on_record = on_record.replace(observation=self.robot.observation.turn(row["s"], yaw))
-        before = select(placed, on_record, cursor.robots)
-        after = self.robot.step(before, row["a"])
-        valid = (placed | cursor.valid) & row["valid"] & ~after.diverged
+        usable = (placed | cursor.valid) & row["valid"]
+        return select(placed, on_record, cursor.robots), row["a"], (keys, yaw, usable)
+
+    def _watch(self, cursor: Cursor, move: Move) -> tuple[Cursor, tuple[jax.Array, ...]]:
+        before, after, (keys, yaw, usable) = move.before, move.after, move.notes
+        valid = usable & ~after.diverged
         out = (before.observation, before.position, after.position, yaw, valid)
         return Cursor(after, yaw, valid, keys), out
 

@@ -102,8 +102,8 @@ class Task(Protocol):
     def start(self, robot: Robot, keys: jax.Array) -> Lanes:
         """Lanes `[B]` at the start of fresh episodes."""
 
-    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
-        """One step of every lane under `[B, A]`; where an episode ended, a fresh one is drawn."""
+    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
+        """What a step of every lane under `[B, A]`, which led to `after`, is worth."""
 
     def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
         """What is worth a learning curve, `[B]` each."""
@@ -130,13 +130,12 @@ class WalkForward:
         robots, streams = _fresh(robot, keys, self.start_yaw)
         return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams)
 
-    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
-        after = robot.step(lanes.robots, action)
+    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
         forward = (after.position[:, 0] - lanes.robots.position[:, 0]) / robot.control_step
         terminal = after.fallen | after.diverged
         reward = forward + robot.alive_bonus * ~terminal - robot.cost(after, action)
         verdict = Verdict(reward, terminal, jnp.zeros_like(reward))
-        return _go_on(self, robot, lanes, action, after, verdict, self.episode_steps)
+        return to_step(lanes, action, after, verdict, self.episode_steps)
 
     def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
         """Forward speed in m/s, reward, falls, divergences."""
@@ -242,7 +241,7 @@ class GoToGoal:
         goal = ahead(robot, robots, distance, bearing)
         return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams[:, 1], goal)
 
-    def judge(
+    def verdict(
         self,
         robot: Robot,
         o: jax.Array,
@@ -262,13 +261,12 @@ class GoToGoal:
         reward, rest = self.reward(robot, step)
         return Verdict(reward, fallen | reached, rest)
 
-    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
-        before, after = lanes.robots, robot.step(lanes.robots, action)
-        verdict = self.judge(
-            robot, before.position, after.position, lanes.goal,
+    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
+        verdict = self.verdict(
+            robot, lanes.robots.position, after.position, lanes.goal,
             robot.cost(after, action), after.fallen | after.diverged,
         )  # fmt: skip
-        return _go_on(self, robot, lanes, action, after, verdict, self.episode_steps)
+        return to_step(lanes, action, after, verdict, self.episode_steps)
 
     def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
         """Speed towards the goal in m/s, arrivals, reward, falls, divergences."""
@@ -304,13 +302,11 @@ def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.
     return robot.reset(streams[:, 1], start_yaw * turn), streams[:, 2]
 
 
-def _go_on(
-    task: Task, robot: Robot, lanes: Lanes, action: jax.Array, after: State, verdict: Verdict,
-    episode_steps: int,
-) -> tuple[Lanes, Step]:  # fmt: skip
-    """The lanes after a step: a fresh episode is drawn where one ended."""
-    last = verdict.terminal | (lanes.age + 1 >= episode_steps)
-    step = Step(
+def to_step(
+    lanes: Lanes, action: jax.Array, after: State, verdict: Verdict, episode_steps: int
+) -> Step:
+    """The transition of lanes that have stepped, and whether their episodes end with it."""
+    return Step(
         before=lanes.robots,
         action=action,
         after=after,
@@ -319,10 +315,15 @@ def _go_on(
         rest=verdict.rest,
         age=lanes.age,
         terminal=verdict.terminal,
-        last=last,
+        last=verdict.terminal | (lanes.age + 1 >= episode_steps),
     )
-    going = lanes.replace(robots=after, age=lanes.age + 1)
-    return select(last, task.start(robot, lanes.keys), going), step
+
+
+def advance(task: Task, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
+    """One step of every lane under `[B, A]`; where an episode ended, a fresh one is drawn."""
+    step = task.judge(robot, lanes, action, robot.step(lanes.robots, action))
+    going = lanes.replace(robots=step.after, age=lanes.age + 1)
+    return select(step.last, task.start(robot, lanes.keys), going), step
 
 
 def _common(step: Step) -> dict[str, jax.Array]:

@@ -18,6 +18,7 @@ from genidm.errors import BadInput
 from genidm.evaluate import Steering
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
+from genidm.rollout import Move, rollout
 from genidm.symmetry import horizontal, wrap
 
 # (o [B, 3], waypoints [B, W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
@@ -293,11 +294,13 @@ def _chunk(
     """
     points = walker.waypoints
 
-    def step(walker: Walker, _: None) -> tuple[Walker, Any]:
-        o, left = walker.robots.position, walker.arrival < 0
-        target = planner(o, points, left)
-        after = robot.step(walker.robots, controller(walker.robots.observation, target - o))
-        steps = walker.steps + 1
+    def act(walker: Walker, _: None) -> tuple[State, jax.Array, None]:
+        robots = walker.robots
+        target = planner(robots.position, points, walker.arrival < 0)
+        return robots, controller(robots.observation, target - robots.position), None
+
+    def watch(walker: Walker, move: Move) -> tuple[Walker, Any]:
+        after, steps, left = move.after, walker.steps + 1, walker.arrival < 0
         turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
         near = horizontal(points - after.position[:, None]) <= settings.reach
         arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
@@ -306,4 +309,4 @@ def _chunk(
         walker = select(walker.going, Walker(after, points, arrival, steps, ~over), walker)
         return walker, look(walker.robots)
 
-    return jax.lax.scan(step, walker, length=settings.chunk)
+    return rollout(robot, act, watch, walker, steps=settings.chunk)

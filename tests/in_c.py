@@ -1,4 +1,8 @@
-"""Robots on MJX beside MuJoCo in C, in float64 and on the same model."""
+"""The oracle of all physics tests: plain `mj_step` on a robot's own model, in float64.
+
+It shares nothing with the engines. `test_engines` holds each of them against it, and
+`test_ant` and `test_humanoid` hold states, turns and mirror images against it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,9 @@ from genidm.symmetry import Layout
 def step_in_c(
     robot: MujocoRobot, physics: Physics, actions: np.ndarray
 ) -> tuple[Physics, np.ndarray]:
-    """Control steps in float64: physics `[B, ...]` after them, and wrenches `[B, nbody, 6]`.
+    """Control steps by `mj_step`: physics `[B, ...]` after them, and wrenches `[B, nbody, 6]`.
+
+    The wrenches are those of the start of the last physics step, as no forward follows it.
 
     Args:
       robot: whose model.

@@ -19,14 +19,16 @@ import pytest
 from point import Point
 
 from experiments.benchmark import __main__ as command
-from experiments.benchmark import collecting, comparing, fitting, sb3, starting, stepping
+from experiments.benchmark import collecting, comparing, fitting, others, sb3, starting, stepping
 from experiments.benchmark.bench import Bench, Options
 from experiments.benchmark.comparing import Row
-from experiments.benchmark.measuring import Probe, interleave, timed
+from experiments.benchmark.measuring import Probe, Skip, interleave, timed
 from experiments.benchmark.rows import ANT, HUMANOID, ROWS, choose
 from genidm.errors import BadInput
 from genidm.methods import GE, LR
 from genidm.models import Architecture
+from genidm.robots import Ant
+from genidm.robots.mujoco import Solver
 
 KEYS = ["name", "value", "unit", "ratio_to", "ratio", "hardware"]
 
@@ -57,7 +59,7 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
     numbers = {"seconds": 8.0, "wall": 9.0, "programs": 3.0}
     both = numbers, dict.fromkeys(numbers, 0.5)
     monkeypatch.setattr(starting, "starts", lambda bench: both)
-    # Neither torch nor Stable-Baselines3 needs to be there, so here they never are.
+    # Torch, Stable-Baselines3 and EnvPool need not be there, so here they never are.
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(ROWS, "point", ANT)
     results = command.benchmark(Point(), small)
@@ -65,20 +67,21 @@ def test_every_row_on_a_point(small, monkeypatch, capsys):
     assert all(list(r) == KEYS for r in results)
     assert all(r["value"] > 0 for r in results)
     skipped = re.findall(r"skipped: (.*?): (.*)", capsys.readouterr().err)
-    # A point is no MuJoCo model, but others are compared with its raw steps all the same.
-    assert {name for name, _ in skipped} == {"raw MJX", "raw MJX, wide", "PPO"}
+    # No engine steps a point, but others are compared with its raw steps all the same.
+    absent = {n for n in (row.name for row in ANT) if re.match("raw |MuJoCo|EnvPool|PPO($| of)", n)}
+    compared = {row.name for row in ANT if row.ratio_to}
+    assert {name for name, _ in skipped} == absent & compared
+    assert dict(skipped)["raw MJX"] == "the point is not stepped by mujoco"
     assert "pip install" in dict(skipped)["PPO"]
     there = {r["name"].partition(" (")[0]: r for r in results}
-    absent = {"MuJoCo in C", "PPO", "PPO of Stable-Baselines3 on gymnasium's Ant-v5"}
     assert set(there) == {row.name for row in ANT} - absent
-    compared = {row.name for row in ANT if row.ratio_to and row.ratio_to != "MuJoCo in C"}
     assert {n for n, r in there.items() if r["ratio"] is not None} == compared - absent
     names = {r["name"] for r in results}
     assert {r["ratio_to"] for r in results} <= names | {None}
     assert there["second start, compiling"]["ratio"] == 0.5 / 8
     assert 0 < there["evaluation, useful"]["ratio"] <= 1
     assert there["evaluation"]["name"] == "evaluation (16 lanes, an untrained controller)"
-    assert there["raw MJX, one device"]["name"].endswith("(8 lanes, 1 device)")
+    assert there["own engine, raw"]["name"].endswith("(robot.step, 8 lanes, 2 devices)")
 
 
 def test_the_humanoids_rows_on_a_point(small, monkeypatch):
@@ -86,7 +89,9 @@ def test_the_humanoids_rows_on_a_point(small, monkeypatch):
     texts = ("SAC", "fit of LR")
     results = command.benchmark(Point(), dataclasses.replace(small, rows=texts))
     ratios = {r["name"].partition(" (")[0]: r["ratio"] for r in results}
-    against_raw = {row.name for row in HUMANOID if row.ratio_to == "raw MJX" and "SAC" in row.name}
+    against_raw = {
+        row.name for row in HUMANOID if row.ratio_to == "own engine, raw" and "SAC" in row.name
+    }
     assert {name for name in against_raw if ratios[name] > 0} == against_raw
     assert {"SAC, learning", "SAC, frozen", "fit of LR"} <= set(ratios)
 
@@ -97,22 +102,45 @@ def test_a_robot_without_rows_and_the_place_of_the_others(ant):
     assert command.place(ant, Options()) == Path("experiments/results/ant_benchmark.json")
 
 
-def test_mujoco_in_c_steps_the_robots_own_model(ant, small):
-    steps = []
+def test_mujoco_batch_steps_the_robots_own_model(ant, small):
+    made = []
 
-    class Pool(stepping.Rollout):
-        def rollout(self, model, data, state, control):
-            assert model is ant.mj_model
-            states, sensors = super().rollout(model, data, state, control)
-            steps.append(states[:, -1, 0] - state[:, 0])
-            return states, sensors
+    class Batch(stepping.Batch):
+        def __init__(self, model, count, nthread):
+            assert (model, count, nthread) == (ant.mj_model, small.lanes, 1)
+            super().__init__(model, count, nthread)
+            made.append(self)
 
     with contextlib.ExitStack() as exits, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stepping, "Rollout", Pool)
-        probe = stepping.in_c(Bench(ant, small, exits))
+        patch.setattr(stepping, "Batch", Batch)
+        patch.setattr(stepping, "on_engine", lambda bench, name: ant)
+        probe = stepping.batch(Bench(ant, small, exits), threads=1)
         assert probe.sample(0.0) > 0
-    np.testing.assert_allclose(steps, stepping.STEPS * ant.control_step)
-    assert np.shape(steps) == (2, small.lanes)  # once to warm up, once timed
+    calls = 2  # once to warm up, once timed
+    np.testing.assert_allclose(made[0].time, calls * stepping.STEPS * ant.control_step)
+    assert made[0].ctrl.any() and probe.note == "8 lanes, 1 thread"
+
+
+def test_a_row_takes_the_engine_that_it_names(small):
+    solver = Solver(iterations=2)
+    with contextlib.ExitStack() as exits:
+        bench = Bench(Ant(solver, "mujoco"), small, exits)
+        other = stepping.on_engine(bench, "mjx")
+        assert other.settings == {**bench.robot.settings, "engine": "mjx"}
+        assert stepping.limit(bench, wide=True).note.startswith("mujoco.batch, 16 lanes, ")
+        probe = stepping.stepping(bench, engine="mujoco")
+        assert probe.sample(0.0) > 0 and "8 lanes, " in probe.note
+        with pytest.raises(Skip, match="there are no 9 devices"):
+            stepping.stepping(bench, count=9)
+        with pytest.raises(Skip, match="1000 threads have"):
+            stepping.batch(bench, threads=1000)
+
+
+def test_envpool_takes_the_same_number_of_robots(small):
+    pytest.importorskip("envpool", reason="EnvPool is not installed")
+    with contextlib.ExitStack() as exits:
+        probe = others.envpool(Bench(Point(), small, exits))
+        assert probe.sample(0.0) > 0 and "8 lanes" in probe.note
 
 
 def test_products_are_those_of_the_networks(ant):
@@ -162,9 +190,10 @@ def test_choose_takes_what_a_row_is_compared_with():
     names = [row.name for row in choose(["two devices"], ANT)]
     assert names == ["raw MJX, one device", "raw MJX, two devices"]
     # A whole name is that row alone.
-    assert {row.name for row in choose(["raw MJX"], ANT)} == {"MuJoCo in C", "raw MJX"}
+    alone = {row.name for row in choose(["raw MJX"], ANT)}
+    assert alone == {"raw mujoco.batch", "MuJoCo in C", "raw MJX"}
     assert choose([], ANT) == list(ANT)
-    with pytest.raises(BadInput, match=r"no row is called 'nothing'; there are: MuJoCo in C;"):
+    with pytest.raises(BadInput, match=r"no row is called 'nothing'; there are: raw mujoco.batch;"):
         choose(["nothing"], ANT)
 
 
@@ -208,7 +237,7 @@ def test_compiling_counts():
 )
 def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
-    monkeypatch.setattr(command, "by_name", lambda name: Point())
+    monkeypatch.setattr(command, "by_name", lambda name, engine: Point())
     monkeypatch.setitem(ROWS, "point", ANT)
     monkeypatch.setattr(command, "measure", None)  # not reached
     with pytest.raises(SystemExit) as stop:

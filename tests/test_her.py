@@ -26,6 +26,7 @@ from genidm.tasks import (
     Sparse,
     Step,
     WalkForward,
+    advance,
     inputs,
     outlook,
     split,
@@ -50,7 +51,7 @@ def walked() -> tuple[Step, Buffer]:
         straight = Straight(jnp.float32(0.9), ROBOT)(lanes.robots.observation, lanes.displacement)
         anywhere = jax.vmap(lambda k: jax.random.uniform(k, (3,), minval=-1.0))(keys)
         to_goal = jnp.arange(LANES)[:, None] % 2 == 0
-        return TASK.advance(ROBOT, lanes, jnp.where(to_goal, straight, anywhere))
+        return advance(TASK, ROBOT, lanes, jnp.where(to_goal, straight, anywhere))
 
     def walk(keys: jax.Array) -> tuple[Step, Any]:
         _, steps = jax.lax.scan(step, TASK.start(ROBOT, keys), length=STEPS)
@@ -169,7 +170,7 @@ def sampled(agent: SAC, task: GoToGoal) -> tuple[Any, Step, Step]:
     goal = batch.observation[:, ROBOT.observation.size :] + were.before.position
     keys = jax.random.split(jax.random.key(3), agent.batch)
     lanes = Lanes(were.before, were.age, keys, goal)
-    _, anew = jax.jit(functools.partial(task.advance, ROBOT))(lanes, were.action)
+    _, anew = jax.jit(functools.partial(advance, task, ROBOT))(lanes, were.action)
     return jax.tree.map(np.asarray, (batch, were, anew))
 
 

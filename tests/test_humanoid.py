@@ -16,7 +16,7 @@ from experiments.humanoid_world import in_world
 from genidm.engines import Physics
 from genidm.robots import Humanoid, HumanoidWorld
 from genidm.robots.humanoid import POWER
-from genidm.tasks import WalkForward
+from genidm.tasks import WalkForward, advance
 
 LANES = 16
 
@@ -251,7 +251,7 @@ def test_reward_is_pybullets(robot: Humanoid) -> None:
     lanes = task.start(robot, jax.random.split(jax.random.key(0), LANES))
     for t in range(12):
         action = jax.random.uniform(jax.random.key(t), (LANES, 17), minval=-1.0)
-        lanes, step = task.advance(robot, lanes, action)
+        lanes, step = advance(task, robot, lanes, action)
     a, after = np.asarray(step.action), np.asarray(step.after.observation)
     place, rate = after[:, 7:41:2], after[:, 8:41:2]
     forward = np.asarray(step.after.position - step.before.position)[:, 0] / 0.0165

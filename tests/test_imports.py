@@ -30,11 +30,11 @@ robots.mujoco
 robots.minitaur robots.ant robots.humanoid robots.logged
 robots.minitaur_env
 robots
-tasks
+rollout tasks
 experience
 agents.policy agents.buffer
 agents.base agents.her
-agents.alternating
+agents.alternating agents.walking
 agents.off_policy
 agents.*
 agents.frozen

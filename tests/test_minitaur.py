@@ -35,7 +35,7 @@ from genidm.robots.minitaur_world import (
     stepped,
 )
 from genidm.scenarios import scenarios
-from genidm.tasks import WalkForward
+from genidm.tasks import WalkForward, advance
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no wheel of it here")
 
@@ -294,7 +294,7 @@ def test_reward_is_that_of_pybullet_envs_a_second(minitaur: Minitaur) -> None:
     task = WalkForward()
     lanes = task.start(minitaur, jax.random.split(jax.random.key(0), LANES))
     for t in range(5):
-        lanes, step = task.advance(minitaur, lanes, chosen(t))
+        lanes, step = advance(task, minitaur, lanes, chosen(t))
     x = parts(rows(step.after.physics).T)
     energy = np.abs((x["torque"] * x["rates"][:8]).sum(0)) * 0.002
     forward = np.asarray(step.after.position - step.before.position)[:, 0]
@@ -307,7 +307,7 @@ def test_processes_are_kept_busy_and_no_more(minitaur: Minitaur) -> None:
     """A robot whose episode is over costs a step, too: who asks for 512 gets 32 a process."""
     bank = flatten(scenarios(minitaur, seeds=1, episodes=600))
     queue = Testing(minitaur, bank, Test(), devices.mesh(jax.devices()[:1])).start()
-    assert queue.episode.shape == (64,)
+    assert queue.running.episode.shape == (64,)
     assert minitaur.at_once(10) == 10
 
 

@@ -25,7 +25,7 @@ from prepared import Prepared
 
 from genidm import collect as collecting
 from genidm import devices, tasks
-from genidm.agents import off_policy
+from genidm.agents import walking
 from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER
 from genidm.agents.off_policy import OffPolicy
@@ -36,7 +36,7 @@ from genidm.errors import BadInput
 from genidm.evaluate import Test, evaluate
 from genidm.experience import load_chunks
 from genidm.progress import METRICS, Progress, read_metrics
-from genidm.robots import Robot
+from genidm.robots import Robot, State
 from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import GoToGoal, Lanes, Sparse, Step, Task, Verdict, WalkForward, inputs
@@ -278,9 +278,11 @@ def test_what_is_cut_off_teaches_nothing(agent: OffPolicy) -> None:
 def actions(agent: OffPolicy, count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
     """Actions `[count, 3]` in one state, and what the policy says of it before tanh."""
     policy = algorithm(agent).start(jax.random.key(0)).policy
-    x, keys = minibatch().observation[0], jax.random.split(jax.random.key(1), count)
-    act = jax.jit(jax.vmap(algorithm(agent).act, (None, None, None, 0)))
-    return np.asarray(act(statistics(), policy, x, keys)), mu(float64(policy), np.asarray(x))
+    x = minibatch().observation[0]
+    numbers = jax.vmap(algorithm(agent).draw)(jax.random.split(jax.random.key(1), count))
+    act = jax.jit(algorithm(agent).act)
+    a = act(statistics(), policy, jnp.broadcast_to(x, (count, *x.shape)), numbers)
+    return np.asarray(a), mu(float64(policy), np.asarray(x))
 
 
 def test_ddpg_explores_around_its_policy_and_at_times_anywhere() -> None:
@@ -325,11 +327,10 @@ class Pointing(GoToGoal):
     episode_steps: int = 4
     bearing: float = math.pi
 
-    def advance(self, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
+    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
         reward = BONUS - jnp.sum((action - wanted(lanes.displacement)) ** 2, axis=-1)
         verdict = Verdict(reward, lanes.displacement[:, 0] > 0, jnp.full_like(reward, REST))
-        after = robot.step(lanes.robots, action)
-        return tasks._go_on(self, robot, lanes, action, after, verdict, self.episode_steps)
+        return tasks.to_step(lanes, action, after, verdict, self.episode_steps)
 
 
 def critics(agent: Any, learner: Any, x: jax.Array, a: jax.Array) -> np.ndarray:
@@ -409,7 +410,7 @@ def test_with_hindsight_ddpg_goes_there_too() -> None:
 def test_recording_changes_no_parameter_by_a_bit(name: str, monkeypatch) -> None:
     agent, task = LEARNERS[name]
     recording = undisturbed(name)[1]
-    monkeypatch.setattr(off_policy, "record", lambda step: None)
+    monkeypatch.setattr(walking, "record", lambda step: None)
     blind = agent.learning(ROBOT, task, devices.mesh())
     learner = blind.place(jax.jit(blind.start)(jax.random.key(0)))
     iterate = blind.prepare(learner)

@@ -21,6 +21,7 @@ from genidm.tasks import (
     Sparse,
     Step,
     WalkForward,
+    advance,
     input_size,
     inputs,
     outlook,
@@ -50,7 +51,7 @@ def walked() -> dict[str, Step]:
 
     def step(lanes, _):
         lanes, keys = split(lanes)
-        made = {name: t.advance(ROBOT, lanes, steering(lanes, keys)) for name, t in tasks.items()}
+        made = {name: advance(t, ROBOT, lanes, steering(lanes, keys)) for name, t in tasks.items()}
         return made["progress"][0], {name: step for name, (_, step) in made.items()}
 
     def walk(keys: jax.Array) -> dict[str, Step]:

@@ -1,6 +1,6 @@
 """How fast everything is, as ratios to what limits it, all measured in one run.
 
-    pip install torch stable-baselines3 "gymnasium[mujoco]"      # for the rows that need them
+    pip install -e ".[benchmark]"      # for the rows of Stable-Baselines3 and EnvPool
     python -m experiments.benchmark --run runs/ant/LR-0-0123456789
 
 A row is measured in turns with the row that it is compared with, and its ratio is the

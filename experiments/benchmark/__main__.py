@@ -6,7 +6,6 @@ import contextlib
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import tyro
 
 from experiments.benchmark.bench import Bench, Options
@@ -30,8 +29,8 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
         raise BadInput(f"there are rows for {' and '.join(ROWS)}, not for {robot.name}")
     rows, out = choose(options.rows, ROWS[robot.name]), place(robot, options)
     for lanes in (options.lanes, options.wide):
-        if lanes % jax.device_count():
-            raise BadInput(f"{lanes} lanes cannot be shared among {jax.device_count()} devices")
+        if lanes % robot.mesh().size:
+            raise BadInput(f"{lanes} lanes cannot be shared among {robot.mesh().size} devices")
     with files.disk(out):  # before the measuring, not after it
         if out.is_dir():
             raise BadInput(f"{out} is a directory")
@@ -56,7 +55,7 @@ def main() -> None:
     def command(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),  # noqa: B008
     ) -> None:
-        print(table(benchmark(by_name(options.robot), options)))
+        print(table(benchmark(by_name(options.robot, options.engine), options)))
 
     guarded(command, "How fast everything is, as ratios to what limits it.")
 

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from jax.sharding import Mesh
 
-from genidm import devices
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
 from genidm.evaluate import Test
@@ -28,6 +27,7 @@ class Options:
 
     Attributes:
       robot: by its name.
+      engine: that steps it; the robot chooses, unless given. Rows of raw stepping measure all.
       out: where the rows are written, as JSON; experiments/results/ROBOT_benchmark.json,
         unless given.
       run: the finished fit stage whose controller is evaluated; an untrained one, unless
@@ -41,6 +41,7 @@ class Options:
     """
 
     robot: str = "ant"
+    engine: str | None = None
     out: Path | None = None
     run: Path | None = None
     rows: tuple[str, ...] = ()
@@ -77,10 +78,14 @@ class Bench:
             self._made[make] = make(self)
         return self._made[make]
 
+    def lanes(self, wide: bool) -> int:
+        """Robots at once: as in 𝒢 and evaluation, or as in collecting."""
+        return self.options.wide if wide else self.options.lanes
+
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """All devices."""
-        return devices.mesh()
+        """The devices that share the lanes, as the robot's engine wants."""
+        return self.robot.mesh()
 
     @functools.cached_property
     def scratch(self) -> Path:

@@ -42,7 +42,7 @@ def evaluating(bench: Bench) -> Probe:
         queue = program(queue)
         return testing.start() if testing.ended(queue) == testing.total else queue
 
-    lanes = queue.episode.shape[0]
+    lanes = queue.running.episode.shape[0]
     call = timed(carried(step, queue), lanes * settings.chunk)
     return Probe(call, f"{lanes} lanes, {_steering(bench)}")
 

@@ -1,25 +1,64 @@
-"""Others' PPO, to compare ours with."""
+"""Others' PPO and others' stepping, to compare ours with."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib
 import importlib.util
 import sys
+from collections.abc import Sequence
 
+import numpy as np
 from tqdm.auto import tqdm
 
 from experiments.benchmark import sb3
-from experiments.benchmark.bench import Bench
+from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, timed
+from experiments.benchmark.stepping import STEPS
 from genidm import devices
 
 
 def baseline(bench: Bench) -> Probe:
     """Stable-Baselines3's PPO at its defaults on gymnasium's Ant-v5, at its fastest here."""
-    missing = [name for name in sb3.NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise Skip(f"{', '.join(missing)} missing: pip install -e '.[benchmark]'")
+    _need(sb3.NEEDED)
     say = functools.partial(tqdm.write, file=sys.stderr)
     setting = sb3.fastest(sb3.candidates(devices.cores()), say)
     agent = bench.exits.enter_context(sb3.Baseline(*setting))
     return Probe(timed(agent.iterate, agent.steps), agent.note)
+
+
+def envpool(bench: Bench, *, wide: bool = False) -> Probe:
+    """EnvPool's Ant-v5 under random actions drawn beforehand, one thread a core.
+
+    It steps gymnasium's model, not ours: each of 5 physics steps is one of RK4, which solves
+    the dynamics four times where Euler's, ours, solves them once, and the solver goes on until
+    it has converged. It also computes rewards, and resets what has fallen.
+
+    Args:
+      bench: sizes.
+      wide: as many environments as 𝒢 and evaluation have lanes.
+    """
+    _need(["envpool"])
+    lanes, threads = bench.lanes(wide), devices.cores()
+    # An extra that may be absent: imported by name, so that the types are checked without it.
+    pool = importlib.import_module("envpool").make_gymnasium(
+        "Ant-v5", num_envs=lanes, num_threads=threads, seed=0
+    )
+    bench.exits.enter_context(contextlib.closing(pool))
+    shape = (STEPS, lanes, *pool.action_space.shape)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+    pool.reset()
+
+    def call() -> None:
+        for action in actions:
+            pool.step(action)
+
+    note = f"Ant-v5: RK4, resets, rewards; {lanes} lanes, {counted(threads, 'thread')}"
+    return Probe(timed(call, lanes * STEPS), note)
+
+
+def _need(packages: Sequence[str]) -> None:
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise Skip(f"{', '.join(missing)} missing: pip install -e '.[benchmark]'")

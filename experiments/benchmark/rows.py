@@ -17,10 +17,10 @@ from experiments.benchmark.collecting import (
 from experiments.benchmark.comparing import Row
 from experiments.benchmark.evaluating import evaluating, tested
 from experiments.benchmark.fitting import fitting, multiplying
-from experiments.benchmark.others import baseline
+from experiments.benchmark.others import baseline, envpool
 from experiments.benchmark.replaying import generalizing
 from experiments.benchmark.starting import starting
-from experiments.benchmark.stepping import in_c, raw
+from experiments.benchmark.stepping import batch, limit, stepping
 from genidm.agents.frozen import Frozen
 from genidm.errors import BadInput
 from genidm.methods import GE, HER_DE, HER_SP, LR, RL, RS, Inverse, Method, by_name
@@ -33,7 +33,9 @@ def _of_humanoid(name: str) -> Inverse:
 
 
 _P = functools.partial  # one object a build: rows that share it share what it compiles
-_RAW = _P(raw)
+_MJX = _P(stepping, engine="mjx")
+# What the robot's own engine can do at most, whichever it is.
+_OWN, _OWN_WIDE = "own engine, raw", "own engine, raw, wide"
 _PPO = _P(collecting, method=RL)
 _WALKER = _of_humanoid("RL")
 assert isinstance(_WALKER.agent, Frozen)
@@ -50,13 +52,11 @@ def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
 def _halves(method: Method) -> tuple[Row, Row, Row]:
     """The loop of an off-policy learner beside its two halves, each run alone."""
     learning = Row(f"{method.name}'s learning alone", "steps/s", _P(updating, method=method))
-    stepping = Row(
-        f"{method.name}'s stepping alone", "steps/s", _P(walking, method=method), "raw MJX"
-    )
+    walk = Row(f"{method.name}'s stepping alone", "steps/s", _P(walking, method=method), _OWN)
     loop = Row(
         f"collecting, {method.name}", "steps/s", _P(collecting, method=method), learning.name
     )
-    return learning, stepping, loop
+    return learning, walk, loop
 
 
 def _fits(method: Inverse) -> tuple[Row, Row]:
@@ -67,25 +67,49 @@ def _fits(method: Inverse) -> tuple[Row, Row]:
 
 
 _STEPPING = (
-    Row("MuJoCo in C", "steps/s", in_c),
-    Row("raw MJX", "steps/s", _RAW, "MuJoCo in C"),
-    Row("raw MJX, wide", "steps/s", _P(raw, wide=True), "MuJoCo in C"),
-    Row("raw MJX, one device", "steps/s", _P(raw, count=1)),
-    Row("raw MJX, two devices", "steps/s", _P(raw, count=2), "raw MJX, one device"),
-    Row("raw MJX, all devices", "steps/s", _RAW, "raw MJX, one device"),
-    Row("collecting, random actions", "steps/s", _P(collecting, method=RS), "raw MJX"),
+    Row("raw mujoco.batch", "steps/s", _P(batch)),
+    Row("raw mujoco.batch, wide", "steps/s", _P(batch, wide=True)),
+    Row("raw mujoco.batch, one thread", "steps/s", _P(batch, threads=1)),
+    Row(
+        "raw mujoco.batch, two threads",
+        "steps/s",
+        _P(batch, threads=2),
+        "raw mujoco.batch, one thread",
+    ),
+    Row("MuJoCo in C", "steps/s", _P(stepping, engine="mujoco"), "raw mujoco.batch"),
+    Row(
+        "MuJoCo in C, wide",
+        "steps/s",
+        _P(stepping, engine="mujoco", wide=True),
+        "raw mujoco.batch, wide",
+    ),
+    Row("raw MJX", "steps/s", _MJX, "MuJoCo in C"),
+    Row("raw MJX, wide", "steps/s", _P(stepping, engine="mjx", wide=True), "MuJoCo in C, wide"),
+    Row("raw MJX, one device", "steps/s", _P(stepping, engine="mjx", count=1)),
+    Row(
+        "raw MJX, two devices",
+        "steps/s",
+        _P(stepping, engine="mjx", count=2),
+        "raw MJX, one device",
+    ),
+    Row("raw MJX, all devices", "steps/s", _MJX, "raw MJX, one device"),
+    Row(_OWN, "steps/s", _P(limit)),
+    Row(_OWN_WIDE, "steps/s", _P(limit, wide=True)),
+    Row("collecting, random actions", "steps/s", _P(collecting, method=RS), _OWN),
 )
 _RUNNING = (
-    Row("𝒢", "steps/s", _P(generalizing), "raw MJX, wide"),
-    Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), "raw MJX, wide"),
-    Row("evaluation", "lane-steps/s", evaluating, "raw MJX, wide"),
+    Row("𝒢", "steps/s", _P(generalizing), _OWN_WIDE),
+    Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), _OWN_WIDE),
+    Row("evaluation", "lane-steps/s", evaluating, _OWN_WIDE),
     Row("evaluation, all", "lane-steps", _P(tested, useful=False), rounds=1),
     Row("evaluation, useful", "lane-steps", _P(tested, useful=True), "evaluation, all", 1),
 )
 ANT: tuple[Row, ...] = (
     *_STEPPING,
-    Row("collecting, PPO", "steps/s", _PPO, "raw MJX"),
-    Row("collecting, PPO's stepping alone", "steps/s", _P(walking, method=RL), "raw MJX"),
+    Row("EnvPool's Ant", "steps/s", _P(envpool), "MuJoCo in C"),
+    Row("EnvPool's Ant, wide", "steps/s", _P(envpool, wide=True), "MuJoCo in C, wide"),
+    Row("collecting, PPO", "steps/s", _PPO, _OWN),
+    Row("collecting, PPO's stepping alone", "steps/s", _P(walking, method=RL), _OWN),
     Row("PPO, record dropped", "steps/s", unrecorded),
     Row("PPO, record kept", "steps/s", _PPO, "PPO, record dropped"),
     Row("writing the record", "steps/s", writing, "collecting, PPO"),
@@ -103,8 +127,8 @@ ANT: tuple[Row, ...] = (
 HUMANOID: tuple[Row, ...] = (
     *_STEPPING,
     *_halves(_SAC),
-    Row("SAC, learning", "steps/s", _P(collecting, method=_SAC), "raw MJX"),
-    Row("SAC, frozen", "steps/s", _P(acting, method=_WALKER), "raw MJX"),
+    Row("SAC, learning", "steps/s", _P(collecting, method=_SAC), _OWN),
+    Row("SAC, frozen", "steps/s", _P(acting, method=_WALKER), _OWN),
     *_RUNNING,
     *_fits(_of_humanoid("LR")),
     *_fits(_of_humanoid("GE")),

@@ -36,7 +36,8 @@ def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
     """What is compiled when a command is started first, and when it is started again."""
     environment = os.environ | {"XDG_CACHE_HOME": str(bench.scratch / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    code = f"from {__name__} import start; start({bench.robot.name!r})"
+    engine = bench.robot.engine and bench.robot.engine.name
+    code = f"from {__name__} import start; start({bench.robot.name!r}, {engine!r})"
     command = [sys.executable, "-c", code]
 
     def once() -> dict[str, float]:
@@ -48,11 +49,11 @@ def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
     return once(), once()
 
 
-def start(robot: str) -> None:
+def start(robot: str, engine: str | None) -> None:
     """In a fresh process: makes PPO's first iteration, and prints what was compiled."""
     with compiling() as counted:
         agent: Any = RL.agent
-        collect(by_name(robot), agent, 1, quiet=True)
+        collect(by_name(robot, engine), agent, 1, quiet=True)
     print(json.dumps(counted))
 
 

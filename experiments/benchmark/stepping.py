@@ -1,16 +1,19 @@
-"""The physics alone: the robot stepped in MuJoCo's C engine, and in MJX."""
+"""The physics alone: `mujoco.batch`, and the robot stepped by each of its engines."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
-from mujoco.rollout import Rollout
+from jax.sharding import Mesh
+from mujoco.batch import Batch
 
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
+from genidm.engines.mujoco import MuJoCo
 from genidm.robots import Robot, State
 from genidm.robots.mujoco import MujocoRobot
 
@@ -18,49 +21,95 @@ from genidm.robots.mujoco import MujocoRobot
 STEPS = 32
 
 
-def in_c(bench: Bench) -> Probe:
-    """MuJoCo in C, one thread a core, on the robot's own model and solver settings."""
-    robot, lanes = bench.robot, bench.options.lanes
-    if not isinstance(robot, MujocoRobot):
-        raise Skip(f"the {robot.name} is no MuJoCo model")
-    model, threads = robot.mj_model, devices.cores()
-    pool = bench.exits.enter_context(Rollout(nthread=threads))
-    data = [mujoco.MjData(model) for _ in range(threads)]
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (lanes, STEPS, model.nu))
-    control = actions.repeat(robot.frames, axis=1)
-    physics = _standing(robot, lanes).physics
-    start = [np.zeros((lanes, 1)), physics.qpos, physics.qvel, np.zeros((lanes, model.na))]
-
-    def step(state: np.ndarray) -> np.ndarray:
-        states, _ = pool.rollout(model, data, state, control)
-        return states[:, -1]
-
-    call = carried(step, np.concatenate(start, axis=1))
-    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {threads} threads")
-
-
-def raw(bench: Bench, *, wide: bool = False, count: int | None = None) -> Probe:
-    """`robot.step` under random actions drawn beforehand, and nothing else.
+def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Probe:
+    """`mujoco.batch` under random actions drawn beforehand, and nothing else.
 
     Args:
       bench: sizes.
       wide: as many lanes as 𝒢 and evaluation have.
-      count: devices; all, unless given.
+      threads: one for each core, unless given.
     """
-    robot, lanes = bench.robot, bench.options.wide if wide else bench.options.lanes
-    count = count or jax.device_count()
-    if count > jax.device_count() or lanes % count:
-        raise Skip(f"{lanes} lanes and {jax.device_count()} devices do not make {count} shares")
-    mesh = devices.mesh(jax.devices()[:count])
-    shape = (STEPS, lanes, robot.action.size)
-    actions = devices.put(jax.random.uniform(jax.random.key(0), shape, minval=-1.0), mesh, 1)
+    robot, lanes = on_engine(bench, "mujoco"), bench.lanes(wide)
+    assert isinstance(robot, MujocoRobot)
+    threads = threads or devices.cores()
+    if threads > devices.cores():
+        raise Skip(f"{threads} threads have {counted(devices.cores(), 'core')}")
+    simulations = Batch(robot.mj_model, lanes, nthread=threads)
+    physics = _standing(robot, lanes).physics
+    simulations.qpos, simulations.qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
+    actions = np.asarray(_actions(robot, lanes), np.float64)
+
+    def call() -> None:
+        for action in actions:
+            simulations.ctrl = action
+            simulations.step(nstep=robot.frames)
+
+    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {counted(threads, 'thread')}")
+
+
+def stepping(
+    bench: Bench, *, engine: str | None = None, wide: bool = False, count: int | None = None
+) -> Probe:
+    """`robot.step` under random actions drawn beforehand, and nothing else.
+
+    Args:
+      bench: sizes.
+      engine: that steps the robot; its own, unless given.
+      wide: as many lanes as 𝒢 and evaluation have.
+      count: devices; as the engine wants, unless given.
+    """
+    robot, lanes = on_engine(bench, engine) if engine else bench.robot, bench.lanes(wide)
+    if (count or 0) > jax.device_count():
+        raise Skip(f"there are no {count} devices")
+    mesh = devices.mesh(jax.devices()[:count]) if count else robot.mesh()
+    if lanes % mesh.size:
+        raise Skip(f"{lanes} lanes do not make {mesh.size} shares")
+    actions = devices.put(_actions(robot, lanes), mesh, 1)
 
     def walk(state: State, actions: jax.Array) -> State:
         return jax.lax.scan(lambda s, a: (robot.step(s, a), None), state, actions)[0]
 
     program = jax.jit(devices.over_lanes(walk, mesh, [0, 1], 0), donate_argnums=0)
     call = carried(lambda s: program(s, actions), devices.put(_standing(robot, lanes), mesh))
-    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {counted(count, 'device')}")
+    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {_among(robot, mesh)}")
+
+
+def limit(bench: Bench, *, wide: bool = False) -> Probe:
+    """The limit of all that steps the robot on its own engine: that engine alone.
+
+    It is `mujoco.batch` for MuJoCo in C, which takes a while on its way into a program and
+    back, and `robot.step` for an engine that is part of the program.
+    """
+    if isinstance(bench.robot.engine, MuJoCo):
+        probe, what = batch(bench, wide=wide), "mujoco.batch"
+    else:
+        probe, what = stepping(bench, wide=wide), "robot.step"
+    return probe._replace(note=f"{what}, {probe.note}")
+
+
+def on_engine(bench: Bench, name: str) -> Robot:
+    """The same robot, stepped by that engine.
+
+    Raises:
+      Skip: it does not step the robot.
+    """
+    robot = bench.robot
+    if name not in robot.engines:
+        raise Skip(f"the {robot.name} is not stepped by {name}")
+    arguments = {key: value for key, value in robot.settings.items() if key != "name"}
+    kind: Any = type(robot)
+    return kind(**{**arguments, "engine": name})
+
+
+def _among(robot: Robot, mesh: Mesh) -> str:
+    """What shares the lanes, in words."""
+    if isinstance(robot.engine, MuJoCo):
+        return counted(robot.engine.threads, "thread")
+    return counted(mesh.size, "device")
+
+
+def _actions(robot: Robot, lanes: int) -> jax.Array:
+    return jax.random.uniform(jax.random.key(0), (STEPS, lanes, robot.action.size), minval=-1.0)
 
 
 def _standing(robot: Robot, lanes: int) -> State:

@@ -106,15 +106,19 @@ class DDPG(OffPolicy):
             targets = jax.tree.map(jnp.copy, params)
             return Networks(*params, *targets, *(adam.init(p) for p in params))
 
-        def act(
-            statistics: RunningStatisticsState, policy: Any, x: jax.Array, key: jax.Array
-        ) -> jax.Array:
+        def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             which, noise, anywhere = jax.random.split(key, 3)
-            action = jnp.tanh(networks[0].apply(statistics, policy, x))
-            action = action + self.noise * jax.random.normal(noise, action.shape)
-            drawn = jax.random.uniform(anywhere, action.shape, minval=-1.0)
+            size = (robot.action.size,)
             explores = jax.random.uniform(which) < self.random
-            return jnp.where(explores, drawn, jnp.clip(action, -1.0, 1.0))
+            drawn = jax.random.uniform(anywhere, size, minval=-1.0)
+            return explores, self.noise * jax.random.normal(noise, size), drawn
+
+        def act(
+            statistics: RunningStatisticsState, policy: Any, x: jax.Array, numbers: Any
+        ) -> jax.Array:
+            explores, noise, drawn = numbers
+            action = jnp.tanh(networks[0].apply(statistics, policy, x)) + noise
+            return jnp.where(explores[:, None], drawn, jnp.clip(action, -1.0, 1.0))
 
         def update(
             n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
@@ -132,4 +136,4 @@ class DDPG(OffPolicy):
             new = Networks(policy, critic, policy_target, critic_target, policy_state, critic_state)
             return new, {"critic_loss": critic_loss, "policy_loss": policy_loss}
 
-        return Algorithm(start, act, update)
+        return Algorithm(start, draw, act, update)

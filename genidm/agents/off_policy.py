@@ -36,10 +36,11 @@ from genidm.agents.buffer import (
 )  # fmt: skip
 from genidm.agents.her import HER
 from genidm.agents.policy import Policy, no_statistics
+from genidm.agents.walking import walk
 from genidm.errors import BadInput
-from genidm.experience import Experience, record
+from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import GoToGoal, Lanes, Task, Verdict, input_size, inputs, outlook, split
+from genidm.tasks import GoToGoal, Lanes, Step, Task, Verdict, input_size, inputs, outlook
 
 
 class Algorithm(NamedTuple):
@@ -47,12 +48,15 @@ class Algorithm(NamedTuple):
 
     Attributes:
       start: key → networks and their optimizers, a tree whose `policy` acts.
-      act: (statistics, policy, inputs `[I]`, key) → action `[A]`, with exploration.
+      draw: key → the random numbers that an action of one robot takes.
+      act: (statistics, policy, inputs `[B, I]`, random numbers `[B, ...]`) → actions `[B, A]`,
+        with exploration.
       update: (tree, statistics, Transition `[N, ...]`, key) → (tree, losses).
     """
 
     start: Callable[[jax.Array], Any]
-    act: Callable[[RunningStatisticsState, Any, jax.Array, jax.Array], jax.Array]
+    draw: Callable[[jax.Array], Any]
+    act: Callable[[RunningStatisticsState, Any, jax.Array, Any], jax.Array]
     update: Callable[..., tuple[Any, Metrics]]
 
 
@@ -201,7 +205,7 @@ class OffPolicy(abc.ABC):
         if self.her:
             assert isinstance(task, GoToGoal)  # `learning` has refused the others
             goal = self.her.goal(buffer, left, at, what, robot.standing_height)
-            verdict = task.judge(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
+            verdict = task.verdict(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
         before, after = (None, None) if goal is None else (goal - rows.o, goal - rows.o_next)
         return Transition(
             observation=inputs(rows.s, before),
@@ -231,12 +235,10 @@ def _walk(
 ) -> tuple[Lanes, Experience, Memory, Metrics]:
     """`unroll` steps of every lane, exploring; outputs `[unroll, B, ...]`."""
 
-    def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Memory, Metrics]]:
-        lanes, keys = split(lanes)
-        fed = inputs(lanes.robots.observation, lanes.displacement)
-        action = jax.vmap(algorithm.act, (None, None, 0, 0))(statistics, policy, fed, keys)
-        lanes, seen = task.advance(robot, lanes, action)
-        return lanes, (record(seen), remember(robot, seen), task.metrics(robot, seen))
+    def choose(x: jax.Array, noise: Any) -> tuple[jax.Array, None]:
+        return algorithm.act(statistics, policy, x, noise), None
 
-    lanes, (experience, part, seen) = jax.lax.scan(step, lanes, length=unroll)
-    return lanes, experience, part, seen
+    def keep(step: Step, notes: None) -> Memory:
+        return remember(robot, step)
+
+    return walk(robot, task, unroll, algorithm.draw, choose, keep, lanes)

@@ -30,10 +30,11 @@ from jax.sharding import Mesh
 from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Learning, Metrics
 from genidm.agents.policy import Policy, no_statistics, normalize
+from genidm.agents.walking import walk
 from genidm.errors import BadInput
-from genidm.experience import Experience, record
+from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook, split
+from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook
 
 # Of what Brax's loss reports, what is worth a curve.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
@@ -195,37 +196,52 @@ def _walk(
     """`unroll` steps of every lane under the policy's own noise; outputs `[unroll, B, ...]`."""
     distribution = networks.parametric_action_distribution
 
-    def step(lanes: Lanes, _: None) -> tuple[Lanes, tuple[Experience, Transition, Metrics]]:
-        lanes, keys = split(lanes)
-        before = inputs(lanes.robots.observation, lanes.displacement)
-        logits = networks.policy_network.apply(statistics, policy, before)
-        raw = jax.vmap(distribution.sample_no_postprocessing)(logits, keys)
-        choice = {
+    def draw(key: jax.Array) -> jax.Array:
+        return jax.random.normal(key, (robot.action.size,))
+
+    def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, Any]:
+        logits = networks.policy_network.apply(statistics, policy, x)
+        normal = distribution.create_dist(logits)
+        raw = normal.loc + normal.scale * noise
+        return distribution.postprocess(raw), (logits, raw)
+
+    def keep(step: Step, notes: Any) -> dict[str, Any]:
+        logits, raw = notes
+        return {
+            "goal": step.goal,
+            "reward": outlook(step, discount),
+            "discount": 1.0 - step.terminal,
+            "truncation": 1.0 * (step.last & ~step.terminal),
             "distribution_params": logits,
             "raw_action": raw,
-            "log_prob": distribution.log_prob(logits, raw),
         }
-        lanes, seen = task.advance(robot, lanes, distribution.postprocess(raw))
-        batch = transition(seen, choice, discount)
-        return lanes, (record(seen), batch, task.metrics(robot, seen))
 
-    lanes, (experience, batch, seen) = jax.lax.scan(step, lanes, length=unroll)
-    # The loss reads no next state but the one after the last step.
-    batch = batch._replace(next_observation=batch.next_observation[-1:])
-    return lanes, experience, batch, seen
+    lanes, experience, kept, seen = walk(robot, task, unroll, draw, choose, keep, lanes)
+    kept["log_prob"] = distribution.log_prob(kept["distribution_params"], kept["raw_action"])
+    return lanes, experience, transition(experience, kept, lanes), seen
 
 
-def transition(step: Step, choice: dict[str, jax.Array], discount: float) -> Transition:
-    """What Brax's loss reads of a step `[B]` and of how its action was chosen."""
+def transition(experience: Experience, kept: dict[str, Any], lanes: Lanes) -> Transition:
+    """What Brax's loss reads of steps `[T, B]`.
+
+    Args:
+      experience: the steps.
+      kept: what PPO has kept of them.
+      lanes: Lanes `[B]` after the last step. The loss asks for the value of its state alone, and
+        not at all where the last step has ended an episode.
+    """
+    goal = kept["goal"]
+    after = inputs(lanes.robots.observation, lanes.displacement)
+    choice = ("distribution_params", "raw_action", "log_prob")
     return Transition(
-        observation=inputs(step.before.observation, step.displacement(step.before)),
-        action=step.action,
-        reward=outlook(step, discount),
-        discount=1.0 - step.terminal,
-        next_observation=inputs(step.after.observation, step.displacement(step.after)),
+        observation=inputs(experience.s, None if goal is None else goal - experience.o),
+        action=experience.a,
+        reward=kept["reward"],
+        discount=kept["discount"],
+        next_observation=after[None],
         extras={
-            "policy_extras": choice,
-            "state_extras": {"truncation": 1.0 * (step.last & ~step.terminal)},
+            "policy_extras": {name: kept[name] for name in choice},
+            "state_extras": {"truncation": kept["truncation"]},
         },
     )
 

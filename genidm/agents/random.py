@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
 
 import flax.struct
 import jax
@@ -11,11 +11,12 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.walking import walk
 from genidm.errors import BadInput
-from genidm.experience import Experience, record
+from genidm.experience import Experience
 from genidm.progress import compiled
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Task, split
+from genidm.tasks import Lanes, Step, Task
 
 
 class Learner(flax.struct.PyTreeNode):
@@ -44,25 +45,27 @@ class RandomActions:
         """There is none: nothing is learned."""
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
-        draw = jax.vmap(lambda key: jax.random.uniform(key, (robot.action.size,), minval=-1.0))
+        def draw(key: jax.Array) -> jax.Array:
+            return jax.random.uniform(key, (robot.action.size,), minval=-1.0)
 
-        def step(lanes: Lanes, _: None) -> tuple[Lanes, Any]:
-            lanes, keys = split(lanes)
-            lanes, transition = task.advance(robot, lanes, draw(keys))
-            return lanes, (record(transition), task.metrics(robot, transition))
+        def choose(_: jax.Array, drawn: jax.Array) -> tuple[jax.Array, None]:
+            return drawn, None
 
-        def walk(lanes: Lanes) -> tuple[Lanes, Any]:
-            return jax.lax.scan(step, lanes, length=self.unroll)
+        def keep(step: Step, notes: None) -> None:
+            """Nothing: nothing is learned."""
+
+        stepping = functools.partial(walk, robot, task, self.unroll, draw, choose, keep)
 
         def start(key: jax.Array) -> Learner:
             return Learner(task.start(robot, jax.random.split(key, self.lanes)))
 
         def prepare(learner: Learner) -> Iterate:
-            sharded = jax.jit(devices.over_lanes(walk, mesh, [0], (0, 1)), donate_argnums=0)
-            program = compiled("random stepping", sharded, learner.lanes)
+            sharded = devices.over_lanes(stepping, mesh, [0], (0, 1, 1, 1))
+            jitted = jax.jit(sharded, donate_argnums=0)
+            program = compiled("random stepping", jitted, learner.lanes)
 
             def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, (experience, seen) = program(learner.lanes)
+                lanes, experience, _, seen = program(learner.lanes)
                 return Learner(lanes), experience, seen
 
             return iterate

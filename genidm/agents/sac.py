@@ -74,11 +74,16 @@ class SAC(OffPolicy):
             states = (adam.init(x) for x in (policy, critic, log_alpha))
             return Networks(policy, critic, target, log_alpha, *states)
 
+        def draw(key: jax.Array) -> jax.Array:
+            return jax.random.normal(key, (robot.action.size,))
+
         def act(
-            statistics: RunningStatisticsState, policy: Any, x: jax.Array, key: jax.Array
+            statistics: RunningStatisticsState, policy: Any, x: jax.Array, noise: jax.Array
         ) -> jax.Array:
             logits = networks.policy_network.apply(statistics, policy, x)
-            return networks.parametric_action_distribution.sample(logits, key)
+            distribution = networks.parametric_action_distribution
+            normal = distribution.create_dist(logits)
+            return distribution.postprocess(normal.loc + normal.scale * noise)
 
         def update(
             n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
@@ -104,4 +109,4 @@ class SAC(OffPolicy):
             )
             return new, info
 
-        return Algorithm(start, act, update)
+        return Algorithm(start, draw, act, update)

@@ -2,7 +2,8 @@
 
 Jitted programs call it with `jax.pure_callback`. What is rounded, and when: MuJoCo computes in
 float64; the rows that enter and leave a control step are float32, so each control step rounds
-position, velocity and warm start once. docs/physics.md says what that costs 𝒢.
+position, velocity and warm start once. docs/physics.md says what that costs 𝒢. Rows of float64,
+under `jax.enable_x64`, stay as they are.
 """
 
 from __future__ import annotations
@@ -64,10 +65,10 @@ class MuJoCo(Engine):
         action = jnp.clip(action, -1.0, 1.0)
         rows = jnp.concatenate([physics.qpos, physics.qvel, physics.warmstart, action], axis=-1)
         width = m.nq + 2 * m.nv + 6 * m.nbody
-        size = jax.ShapeDtypeStruct((len(rows), width), jnp.float32)
-        after = jax.pure_callback(self._step_rows, size, rows.astype(jnp.float32))
+        size = jax.ShapeDtypeStruct((len(rows), width), rows.dtype)
+        after = jax.pure_callback(self._step_rows, size, rows)
         ends = np.cumsum([m.nq, m.nv, m.nv])
-        *parts, wrenches = jnp.split(after.astype(rows.dtype), ends, axis=-1)
+        *parts, wrenches = jnp.split(after, ends, axis=-1)
         return Stepped(Physics(*parts), wrenches.reshape(len(rows), m.nbody, 6))
 
     def _step_rows(self, rows: jax.Array) -> np.ndarray:
@@ -108,7 +109,7 @@ class _Rows:
         finally:
             mujoco.set_mju_user_warning(hearer)
         lost |= batch.warning[:, RESET, 1].any(1)
-        answers = np.empty((len(rows), kept + self._wrenches.shape[1]), np.float32)
+        answers = np.empty((len(rows), kept + self._wrenches.shape[1]), rows.dtype)
         answers[:, :kept] = self._given[:, :kept]
         answers[:, kept:] = self._wrenches
         answers[lost] = np.nan

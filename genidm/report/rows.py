@@ -45,6 +45,7 @@ def results(
     rows: Sequence[Row],
     *,
     robot: str,
+    engine: Any,
     scale: str,
     scenarios: str,
     environment: Mapping[str, Any],
@@ -55,12 +56,13 @@ def results(
       rows: one a method; neighbours are also compared on the same scenarios, and the
         paper's method with every other row.
       robot: its name, as in Table 1.
+      engine: what stepped it; None if it steps itself.
       scale: "quick", "paper" or a number of interactions.
       scenarios: sha256 of the scenario bank.
       environment: "versions" (package → version) and "hardware" (a sentence).
 
     Returns:
-      robot, scale, scenarios, versions, hardware; methods: name → `stats.summary` with
+      robot, engine, scale, scenarios, versions, hardware; methods: name → `stats.summary` with
       interactions, replayed, settings, and where they are known the training_seed of all of
       these, the invariance and, of several training seeds, collecting_seeds: the seeds, the
       episodes of each and `stats.spread`; paired: "LR-GE" → `stats.paired` of LR against
@@ -75,6 +77,7 @@ def results(
         raise ValueError(f"a method stands in two rows: {names}")
     return {
         "robot": robot,
+        "engine": engine and str(engine),
         "scale": scale,
         "scenarios": scenarios,
         "versions": jsonable(environment["versions"]),

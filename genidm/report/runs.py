@@ -84,6 +84,13 @@ class Runs:
             invariance=invariance,
         )
 
+    @property
+    def records(self) -> list[Path]:
+        """The stages that hold the records which the rows learned from."""
+        tests = (test for found in self.found.values() for test in found)
+        names = {t.summary["experience"] for t in tests if "experience" in t.summary}
+        return [self.root / name for name in sorted(names)]
+
     def last_chunk(self) -> Path | None:
         """The last part of the record that a row learned from: the lowest that has one here."""
         for tests in reversed(self.found.values()):
@@ -107,15 +114,20 @@ def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) 
       scale: the scale that the methods were run at.
       settings: of the test.
     """
-    return Runs(robot, root, bank, _by_method(_finished(root, scale, settings), bank.digest()))
+    return Runs(
+        robot, root, bank, _by_method(_finished(robot, root, scale, settings), bank.digest())
+    )
 
 
-def _finished(root: Path, scale: str, settings: Test) -> Iterator[Tested]:
-    """All finished tests at a scale, oldest first."""
+def _finished(robot: Robot, root: Path, scale: str, settings: Test) -> Iterator[Tested]:
+    """All finished tests at a scale, on the robot's engine, oldest first."""
+    engine = robot.engine and robot.engine.name
     done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
     for path in done:
         summary = files.load_json(path)
         if summary["scale"] == scale and summary["test"] == plain(settings):
+            if summary.get("engine") != engine:
+                continue
             yield Tested(path.parent, summary)
 
 

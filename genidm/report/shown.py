@@ -62,12 +62,12 @@ def gather(runs: Runs) -> Shown:
         heading=heading,
         bearing=bearing,
         panels=_panels(runs),
-        collecting=_collecting(runs.root),
+        collecting=_collecting(runs),
         learning={name: records for name, records in learned.items() if _holds(records, "reached")},
         fitting={
             name: records for name, records in learned.items() if _holds(records, "loss_action")
         },
-        residuals=_residuals(runs.root),
+        residuals=_residuals(runs),
         changes=_changes(runs),
     )
 
@@ -97,17 +97,22 @@ def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
     return heading, bearing
 
 
-def _collecting(root: Path) -> Curves:
+def _collecting(runs: Runs) -> Curves:
     curves = {}
-    for done in sorted(root.glob("experience-*/done.json")):
-        _, agent, seed, _ = done.parent.name.split("-")
-        curves[f"{agent}, seed {seed}"] = _metrics(done.parent)
+    for stage in runs.records:
+        _, agent, seed, _ = stage.name.split("-")
+        curves[f"{agent}, seed {seed}"] = _metrics(stage)
     return curves
 
 
-def _residuals(root: Path) -> dict[str, dict[str, np.ndarray]]:
-    done = sorted(root.glob("replay-*/done.json"))
-    stages = {path.parent.name.split("-")[1]: path.parent for path in done}
+def _residuals(runs: Runs) -> dict[str, dict[str, np.ndarray]]:
+    """Those of the replays of the rows' records; of two with one mode the last by name."""
+    records = {stage.name for stage in runs.records}
+    done = (path.parent for path in sorted(runs.root.glob("replay-*/done.json")))
+    of_rows = [
+        s for s in done if files.load_json(s / "config.json")["config"]["experience"] in records
+    ]
+    stages = {stage.name.split("-")[1]: stage for stage in of_rows}
     return {mode: files.load_arrays(stage / "residual")[0] for mode, stage in stages.items()}
 
 

@@ -94,6 +94,8 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
         f"All but “over seeds” is of {_one_seed(methods)}: the mean and standard deviation over "
         "all its test episodes; the interval is a bootstrap over its test seeds.",
     ]
+    if results.get("engine"):
+        notes.append(f"Stepped by {results['engine']}.")
     several = {name: m["collecting_seeds"] for name, m in methods.items() if _several(m)}
     if several:
         notes.append(_over_seeds(several))

@@ -49,7 +49,8 @@ def report(
     shown = gather(runs)
     rows = [runs.row(name, shown.invariance(name)) for name in runs.found]
     written = _document(runs, rows, scale)
-    here = root / f"report-{scale}"
+    engine = f"-{robot.engine.name}" if len(robot.engines) > 1 and robot.engine else ""
+    here = root / f"report-{scale}{engine}"
     _write(here, "", "results.json", written, rows, shown)
     if results:
         _write(results, f"{robot.name}_", f"{robot.name}.json", written, rows, shown)
@@ -58,8 +59,8 @@ def report(
 
 def _document(runs: Runs, rows: list[Row], scale: str) -> dict[str, Any]:
     return results(
-        rows, robot=runs.robot.name, scale=scale, scenarios=runs.bank.digest(),
-        environment=environment(),
+        rows, robot=runs.robot.name, engine=runs.robot.engine, scale=scale,
+        scenarios=runs.bank.digest(), environment=environment(),
     )  # fmt: skip
 
 

@@ -15,15 +15,20 @@ ROBOTS: dict[str, type[Robot]] = {
 }
 
 
-def by_name(name: str) -> Robot:
+def by_name(name: str, engine: str | None = None) -> Robot:
     """The robot of that name, with its default settings.
 
+    Args:
+      name: one of `ROBOTS`.
+      engine: to step it with; the robot chooses, unless given.
+
     Raises:
-      BadInput: there is none.
+      BadInput: there is none of that name, or that engine does not step it.
     """
     if name not in ROBOTS:
         raise BadInput(f"no robot is called {name!r}; there are: {', '.join(ROBOTS)}")
-    return ROBOTS[name]()
+    kind: Any = ROBOTS[name]
+    return kind() if engine is None else kind(engine=engine)
 
 
 def remade(settings: dict[str, Any]) -> Robot:

@@ -25,6 +25,7 @@ def main(
     width: int | None = None,
     height: int | None = None,
     fps: float | None = None,
+    engine: str | None = None,
 ) -> None:
     """Films a controller in episodes of the test (A.1.3), or on its way through waypoints.
 
@@ -43,6 +44,7 @@ def main(
       width: pixels of a picture; 320 in a gif, 640 in an mp4, unless given.
       height: pixels; 240 and 480, unless given.
       fps: pictures a second; 12.5 and 25, unless given.
+      engine: "mjx" or "mujoco"; that of the run, unless given.
 
     Raises:
       BadInput: there is no such file, controller or drawing, or nothing to draw with.
@@ -56,7 +58,7 @@ def main(
     given = {"width": width, "height": height, "fps": fps}
     changes: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
     points = in_twos(waypoints) if waypoints else None
-    made = video.film_run(run, episodes, points, seed, seconds, reach)
+    made = video.film_run(run, episodes, points, seed, seconds, reach, engine)
     for path in paths:
         video.write(made, path, **changes)
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -184,6 +184,7 @@ def film_run(
     seed: int = 0,
     seconds: float = LONGEST,
     reach: float = Follow.reach,
+    engine: str | None = None,
 ) -> Film:
     """Films the controller that lies in a run's directory (METHOD-SEED-…).
 
@@ -194,11 +195,12 @@ def film_run(
       seed: of the test, or of the starts.
       seconds: a longer journey ends here.
       reach: metres; a given waypoint is reached when it is this near (the test has its own).
+      engine: that steps the robot; the run's own, unless given.
 
     Raises:
       BadInput: no controller lies there, its robot has no drawing, or a number cannot be.
     """
-    summary, robot = Stage(run).summary(), robot_of(run)
+    summary, robot = Stage(run).summary(), robot_of(run, engine)
     steering, title = controller.load(run, robot), f"{summary['method']}, {robot.name}"
     if waypoints is None:
         return film_test(robot, steering, episodes or EPISODES, seed, seconds, title)
@@ -230,11 +232,11 @@ def steps(robot: Robot, seconds: float, most: int) -> int:
     return int(min(seconds / robot.control_step, most))
 
 
-def robot_of(run: Path) -> Robot:
+def robot_of(run: Path, engine: str | None = None) -> Robot:
     """The robot that a run's controller was made for, with the settings it had.
 
     A fit's config leaves them to the experience beside it; where that is gone, the robot is
-    taken as it comes.
+    taken as it comes. `engine` takes the place of the run's own.
     """
     experience = Stage(run).summary().get("experience")
     for stage in (run, run.parent / experience) if experience else (run,):
@@ -243,8 +245,8 @@ def robot_of(run: Path) -> Robot:
         except Torn:
             continue
         if settings:
-            return remade(settings)
-    return by_name(Stage(run).summary()["robot"])
+            return remade(settings | ({"engine": engine} if engine else {}))
+    return by_name(Stage(run).summary()["robot"], engine)
 
 
 def _takes(made: Journeys, qpos: np.ndarray) -> Iterator[Take]:
