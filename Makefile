@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 EXTRAS ?= dev
+MINUTES ?= 9
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +11,7 @@ NAME_ANOTHER = name one of these, as in: make $(or $(MAKECMDGOALS),.venv) PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo check format test test-all clean
+.PHONY: help .venv demo gpu gpu-wheels check format test test-all clean
 
 help:  ## this list
 	@sed -nE 's/^([.a-z-]+):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
@@ -34,6 +35,12 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
 	$(BIN)/python -m experiments.ant_rs --scale quick --out runs/demo
 	$(BIN)/python -m experiments.ant_lr --scale quick --out runs/demo
+
+gpu: $(STAMP)  ## try, measure and use a GPU for MINUTES=9 (docs/gpu.md; EXTRAS=dev,cuda)
+	$(BIN)/python -m experiments.gpu --minutes $(MINUTES)
+
+gpu-wheels: $(STAMP)  ## what `make gpu` needs on a machine without a network, into .whl
+	bash experiments/gpu_device.sh prepare
 
 check: $(STAMP)  ## format, lint and types
 	$(BIN)/ruff format --check .

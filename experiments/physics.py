@@ -47,12 +47,12 @@ SETTINGS = (
 
 
 class Precision(NamedTuple):
-    """An engine, and the numbers that it keeps between two control steps.
+    """An engine, and the dtype of its rows between two control steps.
 
     Attributes:
-      name: as the tables have it.
-      engine: by its name.
-      dtype: of the rows.
+      name: in the tables.
+      engine: its name.
+      dtype: of position, velocity and warm start between two control steps.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Precision(NamedTuple):
     dtype: str
 
 
-# As robots are run. MJX computes in its rows' float32, MuJoCo in C in float64 whatever they are.
+# As robots are run. MJX computes in float32; MuJoCo in C computes in float64 and rounds its rows.
 AS_RUN = (
     Precision("MJX float32", "mjx", "float32"),
     Precision("C float32 rows", "mujoco", "float32"),
@@ -126,7 +126,7 @@ def strong(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def endure(robot: MujocoRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
-    """Shakes lanes, shared as the engine wants.
+    """Shakes lanes, on the devices that the engine asks for.
 
     Returns:
       `steps` made, `blow_ups` counted, `seconds` taken.
@@ -206,7 +206,7 @@ def starts(options: Options) -> Physics:
 def drift(
     robot: MujocoRobot, dtype: str, start: Physics, yaw: np.ndarray, actions: np.ndarray
 ) -> np.ndarray:
-    """Metres `[T, B]` between the turned replay and the replay, turned; all in that dtype."""
+    """Metres `[T, B]` between the replay of the turned start and the turned replay, in `dtype`."""
 
     def walk(physics: Physics, yaw: jax.Array, actions: jax.Array) -> jax.Array:
         return walked(robot, physics, yaw, actions)[1]

@@ -1,14 +1,15 @@
-"""Where jax runs: one virtual device a core (or the GPUs), and lanes sharded over them.
+"""Where jax runs: on one CPU device, on several virtual ones, or on GPUs that share the lanes.
 
-XLA on a CPU steps MJX on little more than one core, however many there are, so every
-batch of robots is split over several devices. Keys belong to lanes, so what is computed
-does not depend on how many devices there are, but for the order of float sums.
+XLA on a CPU steps MJX on little more than one core, however many there are, so MJX splits every
+batch of robots over one virtual device a core (`spread`). Keys belong to lanes, so what is
+computed does not depend on how many devices there are, but for the order of float sums.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,21 +27,16 @@ ROBOT = 1 << 17
 def configure() -> None:
     """Sets jax up for this package; called on import, before a backend starts.
 
-    - one CPU device a core (`GENIDM_DEVICES` overrides the number; a number the user
-      has already given to jax stands), and three of XLA's threads for each (`PJRT_NPROC`);
+    - one CPU device, until MJX asks for more, or as many as `GENIDM_DEVICES` says (a number
+      that the user has already given to jax stands);
     - programs on a CPU run while their caller waits (`JAX_CPU_ENABLE_ASYNC_DISPATCH` overrides);
     - float32 matrix products at full precision (`JAX_DEFAULT_MATMUL_PRECISION` overrides);
     - the persistent compilation cache on, in `~/.cache/genidm/xla`
       (`JAX_COMPILATION_CACHE_DIR` overrides).
     """
-    given = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not given and _setting("jax_num_cpu_devices") < 0:
-        count = int(os.environ.get("GENIDM_DEVICES", cores()))
-        # XLA has a thread a core, and a device at work holds one while it waits for others to
-        # do parts of its work: with as many devices as cores 𝒢 hung on two cores, for ever.
-        os.environ.setdefault("PJRT_NPROC", str(3 * count))
+    if "GENIDM_DEVICES" in os.environ:
         with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
-            jax.config.update("jax_num_cpu_devices", count)
+            _make(int(os.environ["GENIDM_DEVICES"]))
     # A program that calls the host can wait for itself, for ever, if it runs in the background
     # (jax issue 25861); MJX on several devices steps as fast without that.
     if "JAX_CPU_ENABLE_ASYNC_DISPATCH" not in os.environ:
@@ -52,6 +48,35 @@ def configure() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def spread() -> None:
+    """Makes one CPU device a core, unless the user has given a number; before jax is used.
+
+    For MJX, which needs them to use more than one core.
+    """
+    try:
+        _make(cores())
+    except RuntimeError:
+        if jax.default_backend() == "cpu" and jax.device_count() < cores():
+            print(
+                f"warning: MJX uses {jax.device_count()} of {cores()} cores, as jax was at work "
+                f"before it was chosen; GENIDM_DEVICES={cores()} gives it all",
+                file=sys.stderr,
+            )
+
+
+def _make(count: int) -> None:
+    """Makes so many CPU devices; raises RuntimeError if a backend has started."""
+    if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    if _setting("jax_num_cpu_devices") >= 0:
+        return
+    # XLA has a thread a core, and a device at work holds one while it waits for others to
+    # do parts of its work: with as many devices as cores 𝒢 hung on two cores, for ever.
+    if count > 1:
+        os.environ.setdefault("PJRT_NPROC", str(3 * count))
+    jax.config.update("jax_num_cpu_devices", count)
 
 
 def cores() -> int:

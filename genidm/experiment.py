@@ -74,9 +74,10 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
         if options.literal:
             raise BadInput(f"{method.name} has no settings that the paper's letter would change")
         return DirectCell(method=method, **given)
-    return InverseCell(
-        method=_fitting(literal(method) if options.literal else method, scale), **given
-    )
+    method = _fitting(literal(method) if options.literal else method, scale)
+    if method.generalize:
+        method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+    return InverseCell(method=method, **given)
 
 
 def _fitting(method: Inverse, scale: Scale) -> Inverse:

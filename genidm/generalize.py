@@ -1,8 +1,8 @@
 """𝒢 (Def. 4): the record's own actions, replayed from a turned start, and the Pairs they give.
 
-Replayed physics is chaotic: in float32 an Ant's way leaves the exactly turned one after
-some tens of steps (docs/physics.md). So 𝒢 replays *segments*: every H steps the robot is
-placed on the record again, turned by a new yaw. Def. 4 allows any trajectory τ ⊆ E.
+Replayed physics is chaotic: rounding takes an Ant's way off the exactly turned one after some
+tens of steps (docs/physics.md). So 𝒢 replays *segments*: every H steps the robot is placed on
+the record again, turned by a new yaw; H is what the engine's rounding allows. Def. 4 allows any trajectory τ ⊆ E.
 Whole episodes (§5.2 to the letter) and exact rotation without physics are modes too.
 """
 
@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import symmetry
+from genidm.engines import Engine
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.pairs import Pairs, pairs
@@ -35,19 +36,26 @@ class Generalize:
       mode: "segments" places the robot on the record again every `segment` steps;
         "episodes" replays whole episodes (the paper's §5.2); "rotate" turns the record
         exactly, without physics.
-      segment: steps of a segment, H.
+      segment: steps of a segment, H; as many as the robot's engine allows, unless given.
       copies: turned copies of the record.
       lanes: robots replayed at once; see `Robot.at_once`.
     """
 
     mode: Mode = "segments"
-    segment: int = 20
+    segment: int | None = None
     copies: int = 1
     lanes: int = 512
 
     def __post_init__(self) -> None:
-        if self.segment < 1 or self.copies < 1 or self.lanes < 1:
+        if min(self.segment or 1, self.copies, self.lanes) < 1 or self.segment == 0:
             raise BadInput("𝒢 needs segment, copies and lanes of at least 1")
+
+    def on(self, robot: Robot) -> Generalize:
+        """The settings with a segment's length chosen for the robot, unless it is given."""
+        if self.segment is not None:
+            return self
+        engine = robot.engine or Engine
+        return dataclasses.replace(self, segment=engine.segment)
 
 
 def replay(
@@ -72,13 +80,14 @@ def replay(
     Raises:
       BadInput: the record is unusable, or holds no physics and the mode needs it.
     """
-    settings = settings or Generalize()
+    settings = (settings or Generalize()).on(robot)
     experience.check(robot)
     if settings.mode == "rotate":
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
     mesh = mesh or robot.mesh()
+    assert settings.segment
     follow = settings.mode == "episodes"
     lanes = robot.at_once(settings.lanes)
     blocks = Blocks(experience, settings.segment, lanes, mesh.size, follow=follow)

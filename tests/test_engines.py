@@ -106,7 +106,7 @@ def apart(got: Any, expected: Any) -> np.ndarray:
 
 
 def test_a_step_is_that_of_mj_step(kind: str, robot: MujocoRobot) -> None:
-    """Where rounding ends a line search elsewhere, a lane is off by the solver's error."""
+    """Rounding can end a line search elsewhere: then a lane is off by the solver's error."""
     actions = actions_of(robot, 1)
     expected = oracle(robot, starts(kind), actions)
     touching = np.abs(expected[1]).max((1, 2)) > 0
@@ -116,7 +116,7 @@ def test_a_step_is_that_of_mj_step(kind: str, robot: MujocoRobot) -> None:
 
 
 def test_a_trajectory_is_that_of_mj_step(kind: str, robot: MujocoRobot) -> None:
-    """A chaotic one: most lanes stay near, and a few need not."""
+    """Physics is chaotic: most lanes stay near, and a few may not."""
     actions = 0.5 * actions_of(robot, STEPS)
     error = apart(tuple(walk(robot, starts(kind), actions)), oracle(robot, starts(kind), actions))
     assert (np.median(error, axis=1) < 2e-3).all()
@@ -124,7 +124,7 @@ def test_a_trajectory_is_that_of_mj_step(kind: str, robot: MujocoRobot) -> None:
 
 
 def test_wrenches_are_of_the_last_physics_steps_start(kind: str, robot: MujocoRobot) -> None:
-    """And not of its end, as they would be after `mj_forward`."""
+    """After `mj_forward` they would be those of its end."""
     actions = actions_of(robot, 1)
     wrenches = walk(robot, starts(kind), actions).readings
     after, expected = oracle(robot, starts(kind), actions)
@@ -200,7 +200,7 @@ def test_a_step_depends_on_its_rows_alone(kind: str, robot: MujocoRobot) -> None
 
 
 def test_lanes_are_alike(kind: str, robot: MujocoRobot) -> None:
-    """XLA does the last lanes of an array otherwise than the rest: there up to rounding."""
+    """A lane's place changes nothing; in XLA up to rounding, as it treats an array's rest apart."""
     order, (action,) = np.random.default_rng(0).permutation(LANES), actions_of(robot, 1)
     got = robot.engine.step(lanes(starts(kind), order), action[order])
     expected = lanes(robot.engine.step(starts(kind), action), order)
@@ -219,7 +219,7 @@ def test_threads_change_no_bit(kind: str, in_c: MujocoRobot) -> None:
 
 
 def test_engines_observe_alike(kind: str) -> None:
-    """And agree on who has fallen: one robot is high up in the air, one lies on its side there."""
+    """They also agree on who has fallen: lane 0 is high in the air, lane 1 lies on its side."""
     start = jax.tree.map(np.copy, starts(kind))
     start.qpos[:2, 2], start.qpos[1, 3:7] = (3.0, 0.7), np.sqrt([0.5, 0.5, 0, 0])
     (action,) = actions_of(made(kind, "mujoco"), 1)
@@ -252,7 +252,7 @@ def record(robot: MujocoRobot, actions: np.ndarray) -> Experience:
 
 
 def test_turned_replays_drift_alike() -> None:
-    """MuJoCo in C rounds once a control step, MJX at each sum: C's replays are the nearer."""
+    """MuJoCo in C rounds once a control step and MJX in each sum, so C drifts less."""
     median = {}
     for engine in ENGINES:
         robot = made("ant", engine)

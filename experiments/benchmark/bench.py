@@ -27,7 +27,8 @@ class Options:
 
     Attributes:
       robot: by its name.
-      engine: that steps it; the robot chooses, unless given. Rows of raw stepping measure all.
+      engine: steps the robot; the robot chooses, unless given. The rows of raw stepping measure
+        every engine in any case.
       out: where the rows are written, as JSON; experiments/results/ROBOT_benchmark.json,
         unless given.
       run: the finished fit stage whose controller is evaluated; an untrained one, unless
@@ -84,7 +85,7 @@ class Bench:
 
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """The devices that share the lanes, as the robot's engine wants."""
+        """The devices that share the robot's lanes."""
         return self.robot.mesh()
 
     @functools.cached_property

@@ -27,8 +27,8 @@ from genidm.tasks import Step
 
 def record(bench: Bench) -> Experience:
     """Random actions, long enough for four blocks of 𝒢."""
-    assert LR.generalize
-    interactions = 4 * bench.options.wide * LR.generalize.segment
+    assert LR.generalize and (segment := LR.generalize.on(bench.robot).segment)
+    interactions = 4 * bench.options.wide * segment
     return collect(bench.robot, _agent(bench, RS), interactions, mesh=bench.mesh, quiet=True)[0]
 
 

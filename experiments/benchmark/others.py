@@ -31,9 +31,10 @@ def baseline(bench: Bench) -> Probe:
 def envpool(bench: Bench, *, wide: bool = False) -> Probe:
     """EnvPool's Ant-v5 under random actions drawn beforehand, one thread a core.
 
-    It steps gymnasium's model, not ours: each of 5 physics steps is one of RK4, which solves
-    the dynamics four times where Euler's, ours, solves them once, and the solver goes on until
-    it has converged. It also computes rewards, and resets what has fallen.
+    It steps gymnasium's model, not ours. A control step is 5 physics steps on both, but its
+    integrator is RK4, which computes the dynamics four times a physics step (our Euler: once),
+    and its solver may make 100 iterations (ours: 4). It also computes rewards, and resets
+    environments whose episode has ended.
 
     Args:
       bench: sizes.

@@ -21,8 +21,8 @@ def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
       bench: sizes.
       program_alone: leave out the sending and bringing back.
     """
-    assert LR.generalize
-    segment, lanes = LR.generalize.segment, bench.robot.at_once(bench.options.wide)
+    assert LR.generalize and (segment := LR.generalize.on(bench.robot).segment)
+    lanes = bench.robot.at_once(bench.options.wide)
     blocks = Blocks(bench.once(record), segment, lanes, bench.mesh.size)
     key = jax.random.key(0)
     keys, block = blocks.example(key)

@@ -34,7 +34,7 @@ def _of_humanoid(name: str) -> Inverse:
 
 _P = functools.partial  # one object a build: rows that share it share what it compiles
 _MJX = _P(stepping, engine="mjx")
-# What the robot's own engine can do at most, whichever it is.
+# The limit for all that steps the robot: its own engine alone, whichever that is.
 _OWN, _OWN_WIDE = "own engine, raw", "own engine, raw, wide"
 _PPO = _P(collecting, method=RL)
 _WALKER = _of_humanoid("RL")

@@ -33,7 +33,7 @@ def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Pr
     assert isinstance(robot, MujocoRobot)
     threads = threads or devices.cores()
     if threads > devices.cores():
-        raise Skip(f"{threads} threads have {counted(devices.cores(), 'core')}")
+        raise Skip(f"{threads} threads need as many cores, and there are {devices.cores()}")
     simulations = Batch(robot.mj_model, lanes, nthread=threads)
     physics = _standing(robot, lanes).physics
     simulations.qpos, simulations.qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
@@ -54,16 +54,16 @@ def stepping(
 
     Args:
       bench: sizes.
-      engine: that steps the robot; its own, unless given.
+      engine: steps the robot; the robot's own, unless given.
       wide: as many lanes as 𝒢 and evaluation have.
-      count: devices; as the engine wants, unless given.
+      count: devices; as many as the engine asks for, unless given.
     """
     robot, lanes = on_engine(bench, engine) if engine else bench.robot, bench.lanes(wide)
     if (count or 0) > jax.device_count():
-        raise Skip(f"there are no {count} devices")
+        raise Skip(f"it needs {count} devices, and there are {jax.device_count()}")
     mesh = devices.mesh(jax.devices()[:count]) if count else robot.mesh()
     if lanes % mesh.size:
-        raise Skip(f"{lanes} lanes do not make {mesh.size} shares")
+        raise Skip(f"{lanes} lanes cannot be shared among {mesh.size} devices")
     actions = devices.put(_actions(robot, lanes), mesh, 1)
 
     def walk(state: State, actions: jax.Array) -> State:
@@ -75,10 +75,10 @@ def stepping(
 
 
 def limit(bench: Bench, *, wide: bool = False) -> Probe:
-    """The limit of all that steps the robot on its own engine: that engine alone.
+    """The robot's own engine alone: the limit for everything that steps the robot.
 
-    It is `mujoco.batch` for MuJoCo in C, which takes a while on its way into a program and
-    back, and `robot.step` for an engine that is part of the program.
+    For MuJoCo in C it is `mujoco.batch`, without the way from a jitted program to the host and
+    back. For other engines it is `robot.step`.
     """
     if isinstance(bench.robot.engine, MuJoCo):
         probe, what = batch(bench, wide=wide), "mujoco.batch"
@@ -102,7 +102,7 @@ def on_engine(bench: Bench, name: str) -> Robot:
 
 
 def _among(robot: Robot, mesh: Mesh) -> str:
-    """What shares the lanes, in words."""
+    """Which threads or devices share the lanes, in words."""
     if isinstance(robot.engine, MuJoCo):
         return counted(robot.engine.threads, "thread")
     return counted(mesh.size, "device")

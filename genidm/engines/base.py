@@ -5,7 +5,7 @@ nothing is kept between two steps. So any state can be set, lanes can be refille
 be replayed (𝒢), and a run that was killed goes on with the same bits.
 
 To add an engine (MuJoCo Warp, say), write one file with a subclass of `Engine`, and name it in
-`genidm.engines.ENGINES`. It has to do four things:
+`genidm.engines.ENGINES`. It has to do five things:
 
 1. `__init__(spec, frame_skip)`: take a MuJoCo model and the number of physics steps in a control
    step. `Physics` is what it is given and gives back.
@@ -15,7 +15,8 @@ To add an engine (MuJoCo Warp, say), write one file with a subclass of `Engine`,
    the other lanes are not touched by it.
 3. Say the moment of its readings: contact wrenches belong to the start of the last physics
    step, as in `mj_step`.
-4. Say where it runs best: `on_accelerator`, and `one_device` if it has threads or processes of
+4. Say how long 𝒢's segments may be (`segment`), measured as `experiments.physics` does.
+5. Say where it runs best: `on_accelerator`, and `one_device` if it has threads or processes of
    its own.
 
 `tests/test_engines.py` holds every engine in `ENGINES` against MuJoCo in C, number by number.
@@ -67,6 +68,8 @@ class Engine(abc.ABC):
     Attributes:
       name: as `--engine` takes it.
       on_accelerator: whether it is the one to choose where jax has an accelerator.
+      segment: control steps that a turned replay stays within millimetres of the record for
+        (docs/physics.md): the segments of 𝒢, unless the user gives their length.
       one_device: whether all lanes lie on one jax device, because the engine shares them among
         threads or processes of its own.
     """
@@ -74,6 +77,7 @@ class Engine(abc.ABC):
     name: ClassVar[str]
     on_accelerator: ClassVar[bool] = False
     one_device: ClassVar[bool] = True
+    segment: ClassVar[int] = 20
 
     @abc.abstractmethod
     def step(self, physics: Any, action: jax.Array) -> Stepped:

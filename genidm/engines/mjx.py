@@ -24,6 +24,7 @@ class MJX(Engine):
     one_device = False
 
     def __init__(self, spec: mujoco.MjSpec, frame_skip: int):
+        devices.spread()
         model = spec.compile()
         self._frame_skip = frame_skip
         self._model = mjx.put_model(model, impl="jax")

@@ -37,6 +37,7 @@ class MuJoCo(Engine):
     """
 
     name = "mujoco"
+    segment = 50
 
     def __init__(self, spec: mujoco.MjSpec, frame_skip: int, threads: int | None = None):
         measured = spec.copy()
