@@ -2,7 +2,8 @@
 
 Replayed physics is chaotic: rounding takes an Ant's way off the exactly turned one after some
 tens of steps (docs/physics.md). So 𝒢 replays *segments*: every H steps the robot is placed on
-the record again, turned by a new yaw; H is what the engine's rounding allows. Def. 4 allows any trajectory τ ⊆ E.
+the record again, turned by a new yaw; H is what the engine's rounding allows. Def. 4 allows
+any trajectory τ ⊆ E.
 Whole episodes (§5.2 to the letter) and exact rotation without physics are modes too.
 """
 

@@ -25,10 +25,16 @@ from genidm.methods import LR, RL, RS, Method
 from genidm.tasks import Step
 
 
+def segment(bench: Bench) -> int:
+    """Steps of a segment of 𝒢, on the robot's engine."""
+    settings = LR.generalize and LR.generalize.on(bench.robot)
+    assert settings and settings.segment
+    return settings.segment
+
+
 def record(bench: Bench) -> Experience:
     """Random actions, long enough for four blocks of 𝒢."""
-    assert LR.generalize and (segment := LR.generalize.on(bench.robot).segment)
-    interactions = 4 * bench.options.wide * segment
+    interactions = 4 * bench.options.wide * segment(bench)
     return collect(bench.robot, _agent(bench, RS), interactions, mesh=bench.mesh, quiet=True)[0]
 
 

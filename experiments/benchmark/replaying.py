@@ -7,9 +7,8 @@ import functools
 import jax
 
 from experiments.benchmark.bench import Bench, counted
-from experiments.benchmark.collecting import record
+from experiments.benchmark.collecting import record, segment
 from experiments.benchmark.measuring import Probe, carried, timed
-from genidm.methods import LR
 from genidm.progress import Progress
 from genidm.replaying import Blocks, Runner
 
@@ -21,9 +20,8 @@ def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
       bench: sizes.
       program_alone: leave out the sending and bringing back.
     """
-    assert LR.generalize and (segment := LR.generalize.on(bench.robot).segment)
     lanes = bench.robot.at_once(bench.options.wide)
-    blocks = Blocks(bench.once(record), segment, lanes, bench.mesh.size)
+    blocks = Blocks(bench.once(record), segment(bench), lanes, bench.mesh.size)
     key = jax.random.key(0)
     keys, block = blocks.example(key)
     runner = Runner(bench.robot, bench.mesh, (keys, block))
