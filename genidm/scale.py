@@ -55,9 +55,9 @@ def scale_of(text: str, interactions: int) -> Scale:
     if text == "paper":
         return Scale("paper", interactions, 1.0, 10, 1000)
     if text == "quick":
-        hurried = PPO(discount=0.97, epochs=7, minibatches=8)
+        hurried = PPO(discount=0.97, learning_rate=1e-3, entropy=0.0)
         return Scale(
-            "quick", 240_000, 0.1, 2, 50, look_ahead=50, share=1.0, learning=2 / 3, ppo=hurried
+            "quick", 400_000, 0.1, 2, 50, look_ahead=50, share=1.0, learning=2 / 3, ppo=hurried
         )
     try:
         share = float(text)

@@ -19,10 +19,10 @@ from mujoco.batch import Batch, SimulationError
 from genidm.devices import cores
 from genidm.engines.base import Engine, Physics, Stepped
 
-# Warnings after which MuJoCo has reset a simulation by itself.
-_WARNING = mujoco.mjtWarning
-RESET = [
-    x.value for x in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
+# Warnings of a simulation that is lost: MuJoCo has reset it, or has set its controls to 0.
+_W = mujoco.mjtWarning
+LOST = [
+    x.value for x in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_BADCTRL)
 ]
 
 
@@ -109,7 +109,8 @@ class _Rows:
             lost[error.ids] = True
         finally:
             mujoco.set_mju_user_warning(hearer)
-        lost |= batch.warning[:, RESET, 1].any(1)
+        if batch.warning[..., 1].any():
+            lost |= batch.warning[:, LOST, 1].any(1)
         answers = np.empty((len(rows), kept + self._wrenches.shape[1]), rows.dtype)
         answers[:, :kept] = self._given[:, :kept]
         answers[:, kept:] = self._wrenches

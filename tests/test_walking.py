@@ -1,0 +1,114 @@
+"""An agent's steps, held against a loop that takes them one by one."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bits import close, same
+from point import Point
+
+from genidm import devices
+from genidm.agents.walking import walk
+from genidm.experience import Experience
+from genidm.tasks import GoToGoal, Lanes, Step, Task, WalkForward
+
+# It falls often, so that lanes end several episodes within one walk.
+ROBOT = Point(speed=4.0, falls_at=1.2)
+SHORT = Point(speed=4.0, falls_at=0.35)
+LANES, STEPS = 24, 40
+TASKS: dict[str, Task] = {
+    "forward": WalkForward(episode_steps=15),
+    "goal": GoToGoal(episode_steps=15, reach=0.5),
+}
+each = pytest.mark.parametrize("name", TASKS)
+
+
+def draw(key: jax.Array) -> jax.Array:
+    return jax.random.uniform(key, (3,), minval=-1.0)
+
+
+def choose(x: jax.Array, drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return drawn, x
+
+
+def keep(step: Step, fed: jax.Array) -> tuple[Step, jax.Array]:
+    return step, fed
+
+
+def start(task: Task, robot: Point = ROBOT) -> Lanes:
+    return jax.jit(functools.partial(task.start, robot))(jax.random.split(jax.random.key(0), LANES))
+
+
+@functools.cache
+def walked(name: str, robot: Point = ROBOT) -> tuple[Lanes, Experience, Any, dict[str, Any]]:
+    program = jax.jit(functools.partial(walk, robot, TASKS[name], STEPS, draw, choose, keep))
+    return jax.tree.map(np.asarray, program(start(TASKS[name], robot)), is_leaf=is_array)
+
+
+def is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array)
+
+
+@each
+def test_a_lane_goes_on_from_where_it_was_or_starts_afresh(name: str) -> None:
+    lanes, record, (step, _), _ = walked(name)
+    same(step.before.physics.position[0], start(TASKS[name]).robots.physics.position)
+    going, ended = ~step.last[:-1], step.last[:-1]
+    assert going.any() and ended.any()
+    np.testing.assert_array_equal(
+        step.before.physics.position[1:][going], step.after.physics.position[:-1][going]
+    )
+    np.testing.assert_array_equal(step.age[1:][going], step.age[:-1][going] + 1)
+    assert (step.age[1:][ended] == 0).all() and (record.first == (step.age == 0)).all()
+    # Fresh starts lie near the origin, where no robot was that had gone on.
+    assert np.linalg.norm(step.before.position[1:][ended][:, :2], axis=-1).max() < 0.15
+    same(
+        lanes.robots.physics.position[~step.last[-1]],
+        step.after.physics.position[-1][~step.last[-1]],
+    )
+
+
+@each
+def test_the_robot_makes_the_steps_that_are_recorded(name: str) -> None:
+    _, record, (step, fed), metrics = walked(name)
+    flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), step)
+    after = jax.jit(ROBOT.step)(flat.before, flat.action)
+    close(after.position, flat.after.position, atol=1e-6)
+    anew = TASKS[name].judge(
+        ROBOT, Lanes(flat.before, flat.age, jax.random.split(jax.random.key(0), len(flat.age)), flat.goal),
+        flat.action, flat.after,
+    )  # fmt: skip
+    close(anew.reward, flat.reward, atol=1e-5)
+    assert (np.asarray(anew.last) == np.asarray(flat.last)).all()
+    np.testing.assert_array_equal(record.a, step.action)
+    np.testing.assert_array_equal(fed[..., : record.s.shape[-1]], record.s)
+    assert metrics["reward"].shape == (STEPS, LANES)
+
+
+def test_no_start_and_no_action_comes_twice_however_short_the_episodes() -> None:
+    """Lanes that end more than one episode in a walk draw starts anew within it."""
+    _, record, (step, _), _ = walked("forward", SHORT)
+    assert step.last.sum(0).min() >= 3
+    starts = step.before.position[record.first]
+    assert len(np.unique(starts, axis=0)) == len(starts) == record.first.sum()
+    actions = record.a.reshape(-1, 3)
+    assert len(np.unique(actions, axis=0)) == len(actions)
+
+
+@each
+def test_lanes_walk_alike_however_they_are_shared_out(name: str) -> None:
+    task = TASKS[name]
+
+    def on(count: int) -> Any:
+        mesh = devices.mesh(jax.devices()[:count])
+        body = functools.partial(walk, ROBOT, task, STEPS, draw, choose, keep)
+        program = jax.jit(devices.over_lanes(body, mesh, [0], (0, 1, 1, 1)))
+        return program(devices.put(start(task), mesh))
+
+    one, two = on(1), on(2)
+    close(one, two, atol=1e-5)
