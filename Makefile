@@ -33,8 +33,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installed. For python to mean this one, here: source $(VENV)/bin/activate"
 
 demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
-	$(BIN)/python -m experiments.ant_rs --scale quick --out runs/demo
-	$(BIN)/python -m experiments.ant_lr --scale quick --out runs/demo
+	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --out runs/demo
 
 gpu: $(STAMP)  ## try, measure and use a GPU for MINUTES=9 (docs/gpu.md; EXTRAS=dev,cuda)
 	$(BIN)/python -m experiments.gpu --minutes $(MINUTES)
@@ -51,11 +50,12 @@ format: $(STAMP)  ## mend what the linter can, and bring every file into its for
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
+# Most of a test's time is compiling, which uses one core. Files stay whole: their tests share programs.
 test: $(STAMP)  ## the tests, without the slow ones
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist loadfile
 
 test-all: $(STAMP)  ## the slow tests too
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 clean:  ## remove .venv, caches and build outputs; runs/ stays
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache build dist genidm.egg-info

@@ -13,7 +13,7 @@ from genidm.cells import InverseCell
 from genidm.config import environment, plain
 from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.experiment import Options, announced, bank_of, cell, film_cell, guarded
+from genidm.experiment import Options, announce, bank_of, cell, film_cell, guarded
 from genidm.methods import LR, Inverse
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
@@ -75,6 +75,7 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
       the directory of the results.
     """
     of = cells(robot, method, options)
+    announce(robot, options.engine)
     first = next(iter(of.values()))[0]
     bank = bank_of(first, options)
     tests = {k: [tested(this, bank, options.video) for this in these] for k, these in of.items()}
@@ -144,7 +145,7 @@ def metres(value: float | None) -> str:
 
 def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> None:
     """Fits, tests, and prints the numbers."""
-    robot = announced(by_name(options.robot, options.engine), options.engine)
+    robot = by_name(options.robot, options.engine)
     print((run(robot, LR, options) / "table.txt").read_text())
 
 

@@ -16,7 +16,7 @@ from genidm.cells import Cell
 from genidm.errors import BadInput
 from genidm.experiment import (
     Options,
-    announced,
+    announce,
     bank_of,
     cell,
     film_cell,
@@ -115,6 +115,7 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
       BadInput: an option cannot be; nothing has been run then.
     """
     todo = work(robot, methods, options)
+    announce(robot, options.engine)
     failures, ended, first = list[Exception](), False, todo[0]
     for number, item in enumerate(todo, 1):
         print(f"{item} ({number} of {len(todo)})", file=sys.stderr)
@@ -144,9 +145,8 @@ def attempt(item: Work) -> Exception | None:
 
 def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
     """Runs the cells and prints the table; a cell that failed shows in the exit status."""
-    methods = chosen(options)
-    robot = announced(robot_by_name(options.robot, options.engine), options.engine)
-    report, failures = run(robot, methods, options)
+    robot = robot_by_name(options.robot, options.engine)
+    report, failures = run(robot, chosen(options), options)
     if report:
         print((report / "table.txt").read_text())
     if failures:

@@ -100,6 +100,7 @@ def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
       the directory of the report.
     """
     this = cell(robot, method, options)
+    announce(robot, options.engine)
     tested = bank_of(this, options)
     this.episodes(tested)
     if options.video:
@@ -129,13 +130,15 @@ def saved(
     models: dict[str, tuple[Steering, dict[str, Any]]] = {}
     for run in runs:
         summary = Stage(run).summary()
-        robot, name = summary["robot"], summary["method"]
-        robots.setdefault(robot, by_name(robot, engine))
-        model = controller.load(run, robots[robot])
+        kind, name = summary["robot"], summary["method"]
+        robots.setdefault(kind, by_name(kind, engine))
+        model = controller.load(run, robots[kind])
         models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
     if len(robots) > 1:
         raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")
-    return announced(next(iter(robots.values())), engine), models
+    (robot,) = robots.values()
+    announce(robot, engine)
+    return robot, models
 
 
 def film_cell(this: Cell[Any]) -> None:
@@ -171,14 +174,13 @@ def write_report(this: Cell[Any], bank: Scenarios, options: Options) -> Path:
     return report(this.robot, this.root, bank, this.scale.name, options.test, options.results)
 
 
-def announced(robot: Robot, engine: str | None) -> Robot:
-    """The robot, once it is said on stderr what steps it and, if nobody chose that, why."""
+def announce(robot: Robot, engine: str | None) -> None:
+    """Says on stderr what steps a robot and, if the user named no `engine`, why."""
     if robot.engine:
         where = "an accelerator" if devices.memory() else "no accelerator"
         others = " or ".join(name for name in robot.engines if name != robot.engine.name)
         why = f": jax has {where}; --engine {others} instead" if engine is None and others else ""
         print(f"{robot.name} on {robot.engine}{why}", file=sys.stderr)
-    return robot
 
 
 def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
@@ -189,8 +191,7 @@ def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
         method: Direct | Inverse = method,
     ) -> None:
         with_engine = {} if options.engine is None else {"engine": options.engine}
-        made = announced(robot(**with_engine), options.engine)
-        print((run_cell(made, method, options) / "table.txt").read_text())
+        print((run_cell(robot(**with_engine), method, options) / "table.txt").read_text())
 
     guarded(command, f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end.")
 

@@ -41,7 +41,7 @@ from genidm.files import load_arrays, save_arrays
 from genidm.generalize import Generalize
 from genidm.methods import Inverse, Method, literal
 from genidm.progress import METRICS, Progress, read_metrics
-from genidm.robots import Ant, Humanoid, Minitaur, Robot
+from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur, Robot
 from genidm.scale import Scale, scale_of
 from genidm.scenarios import scenarios
 from genidm.store import Stage
@@ -331,7 +331,7 @@ def dying(*args, **kwargs):
 
 
 def test_it_is_tested_again_like_any_controller(direct: Finished, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(controller, "by_name", lambda name: Point())
+    monkeypatch.setitem(ROBOTS, "point", Point)
     evaluate.main((stage_of(direct.out, "VGCP"),), seeds=10, episodes=2, test=TEST)
     mean = direct.results["methods"]["VGCP"]["mean"]
     (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("VGCP"))
@@ -339,7 +339,7 @@ def test_it_is_tested_again_like_any_controller(direct: Finished, capsys, monkey
 
 
 def test_runs_are_tested_again_side_by_side(direct: Finished, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(controller, "by_name", lambda name: Point())
+    monkeypatch.setitem(ROBOTS, "point", Point)
     run = stage_of(direct.out, "VGCP")
     evaluate.main((run, run), seeds=2, episodes=2, test=TEST)
     shown = capsys.readouterr().out.splitlines()
@@ -351,7 +351,7 @@ def test_runs_are_tested_again_side_by_side(direct: Finished, capsys, monkeypatc
 
 
 def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(controller, "by_name", lambda name: {"point": Point()}[name])
+    monkeypatch.setitem(ROBOTS, "point", Point)
     runs = (stage_of(direct.out, "VGCP"),) * 2
     waypoints.main(runs, robots=2, out=tmp_path, settings=Follow(max_steps=20, chunk=10))
     written = json.loads((tmp_path / "point_waypoints.json").read_text())
@@ -369,7 +369,7 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
 
 def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:
     """Of the agents that learned; random actions leave no policy."""
-    monkeypatch.setattr(controller, "by_name", lambda name: {"point": Point()}[name])
+    monkeypatch.setitem(ROBOTS, "point", Point)
     with pytest.raises(BadInput, match="no agent has collected"):
         walk.main(finished.out)
     walk.main(finished.out / "point", episodes=4)

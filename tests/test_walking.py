@@ -79,10 +79,9 @@ def test_the_robot_makes_the_steps_that_are_recorded(name: str) -> None:
     flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), step)
     after = jax.jit(ROBOT.step)(flat.before, flat.action)
     close(after.position, flat.after.position, atol=1e-6)
-    anew = TASKS[name].judge(
-        ROBOT, Lanes(flat.before, flat.age, jax.random.split(jax.random.key(0), len(flat.age)), flat.goal),
-        flat.action, flat.after,
-    )  # fmt: skip
+    keys = jax.random.split(jax.random.key(0), len(flat.age))
+    lanes = Lanes(flat.before, flat.age, keys, flat.goal)
+    anew = TASKS[name].judge(ROBOT, lanes, flat.action, flat.after)
     close(anew.reward, flat.reward, atol=1e-5)
     assert (np.asarray(anew.last) == np.asarray(flat.last)).all()
     np.testing.assert_array_equal(record.a, step.action)
