@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bits import close, same
+from bits import close, is_key, same
 from point import Point
 
 from genidm import devices
@@ -47,11 +47,9 @@ def start(task: Task, robot: Point = ROBOT) -> Lanes:
 @functools.cache
 def walked(name: str, robot: Point = ROBOT) -> tuple[Lanes, Experience, Any, dict[str, Any]]:
     program = jax.jit(functools.partial(walk, robot, TASKS[name], STEPS, draw, choose, keep))
-    return jax.tree.map(np.asarray, program(start(TASKS[name], robot)), is_leaf=is_array)
-
-
-def is_array(x: Any) -> bool:
-    return isinstance(x, jax.Array)
+    return jax.tree.map(
+        lambda x: x if is_key(x) else np.asarray(x), program(start(TASKS[name], robot))
+    )
 
 
 @each

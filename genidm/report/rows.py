@@ -45,10 +45,10 @@ def results(
     rows: Sequence[Row],
     *,
     robot: str,
-    engine: Any,
     scale: str,
     scenarios: str,
     environment: Mapping[str, Any],
+    engine: Any = None,
 ) -> dict[str, Any]:
     """The rows as one JSON document, methods in the order given; distances in metres.
 
@@ -56,10 +56,10 @@ def results(
       rows: one a method; neighbours are also compared on the same scenarios, and the
         paper's method with every other row.
       robot: its name, as in Table 1.
-      engine: what stepped it; None if it steps itself.
       scale: "quick", "paper" or a number of interactions.
       scenarios: sha256 of the scenario bank.
       environment: "versions" (package → version) and "hardware" (a sentence).
+      engine: what stepped the robot; None if it steps itself.
 
     Returns:
       robot, engine, scale, scenarios, versions, hardware; methods: name → `stats.summary` with

@@ -19,6 +19,7 @@ from genidm.methods import ORDER
 from genidm.report.rows import Row
 from genidm.robots import Robot
 from genidm.scenarios import Scenarios
+from genidm.store import Stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,10 +87,10 @@ class Runs:
 
     @property
     def records(self) -> list[Path]:
-        """The stages that hold the records which the rows learned from."""
+        """The stages of the records that the rows learned from, as far as they are finished."""
         tests = (test for found in self.found.values() for test in found)
         names = {t.summary["experience"] for t in tests if "experience" in t.summary}
-        return [self.root / name for name in sorted(names)]
+        return [self.root / name for name in sorted(names) if Stage(self.root / name).done]
 
     def last_chunk(self) -> Path | None:
         """The last part of the record that a row learned from: the lowest that has one here."""
