@@ -48,7 +48,8 @@ class Generalize:
     lanes: int = 512
 
     def __post_init__(self) -> None:
-        if min(self.segment or 1, self.copies, self.lanes) < 1 or self.segment == 0:
+        segment = 1 if self.segment is None else self.segment
+        if min(segment, self.copies, self.lanes) < 1:
             raise BadInput("𝒢 needs segment, copies and lanes of at least 1")
 
     def on(self, robot: Robot) -> Generalize:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +11,9 @@ from mujoco.batch import Batch
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
+from genidm.config import plain
 from genidm.engines.mujoco import MuJoCo
-from genidm.robots import Robot, State
+from genidm.robots import Robot, State, remade
 from genidm.robots.mujoco import MujocoRobot
 
 # Steps of a lane in a call, as in an iteration of PPO.
@@ -96,9 +95,7 @@ def on_engine(bench: Bench, name: str) -> Robot:
     robot = bench.robot
     if name not in robot.engines:
         raise Skip(f"the {robot.name} is not stepped by {name}")
-    arguments = {key: value for key, value in robot.settings.items() if key != "name"}
-    kind: Any = type(robot)
-    return kind(**{**arguments, "engine": name})
+    return remade(plain(robot.settings) | {"engine": name})
 
 
 def _among(robot: Robot, mesh: Mesh) -> str:

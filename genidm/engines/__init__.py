@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import mujoco
 
 from genidm.engines.base import Engine, Physics, Stepped
+from genidm.engines.mjx import MJX
+from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
 
-# Engines of MuJoCo models, by name; imported when they are chosen, as MJX takes seconds.
-ENGINES = {"mjx": "MJX", "mujoco": "MuJoCo"}
+# Engines of MuJoCo models.
+ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (MJX, MuJoCo)}
 
 
 def choose(name: str | None, offered: Sequence[str], robot: str) -> str:
     """The engine to step a robot with.
 
     Args:
-      name: what the user asks for; None chooses MJX where jax has an accelerator, else MuJoCo
-        in C, which steps several times as fast on a CPU.
+      name: what the user asks for; None chooses one for an accelerator where jax has one, else
+        one for a CPU (`Engine.on_accelerator`).
       offered: the engines that can step the robot.
       robot: its name.
 
@@ -28,8 +30,9 @@ def choose(name: str | None, offered: Sequence[str], robot: str) -> str:
       BadInput: the robot is not stepped by that engine.
     """
     if name is None:
-        usual = "mujoco" if jax.default_backend() == "cpu" else "mjx"
-        return usual if usual in offered else offered[0]
+        accelerated = jax.default_backend() != "cpu"
+        fit = [x for x in offered if x in ENGINES and ENGINES[x].on_accelerator == accelerated]
+        return (fit or list(offered))[0]
     if name not in offered:
         raise BadInput(f"the {robot} is stepped by {' or '.join(offered)}, not by {name!r}")
     return name
@@ -43,9 +46,8 @@ def of_model(name: str, spec: mujoco.MjSpec, frame_skip: int) -> Engine:
       spec: the model.
       frame_skip: physics steps a control step.
     """
-    return getattr(importlib.import_module(f"genidm.engines.{name}"), ENGINES[name])(
-        spec, frame_skip
-    )
+    kind: Any = ENGINES[name]  # a subclass, which takes arguments
+    return kind(spec, frame_skip)
 
 
 __all__ = ["ENGINES", "Engine", "Physics", "Stepped", "choose", "of_model"]

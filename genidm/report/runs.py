@@ -126,9 +126,8 @@ def _finished(robot: Robot, root: Path, scale: str, settings: Test) -> Iterator[
     done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
     for path in done:
         summary = files.load_json(path)
-        if summary["scale"] == scale and summary["test"] == plain(settings):
-            if summary.get("engine") != engine:
-                continue
+        asked = (scale, plain(settings), engine)
+        if (summary["scale"], summary["test"], summary.get("engine")) == asked:
             yield Tested(path.parent, summary)
 
 
