@@ -12,8 +12,9 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -25,6 +26,7 @@ from genidm.agents.policy import Policy
 from genidm.collect import collect, whole
 from genidm.config import plain
 from genidm.episodes import Episodes
+from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test, episodes, flatten, run
 from genidm.experience import Experience
 from genidm.fit import Fit, fit
@@ -32,12 +34,27 @@ from genidm.generalize import replay, residual
 from genidm.methods import Direct, Inverse, Method
 from genidm.pairs import pairs
 from genidm.replaying import Replay
-from genidm.robots import Robot
+from genidm.robots import Robot, State
 from genidm.scale import Scale
 from genidm.scenarios import Scenarios, tours
 from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
+
+# Episodes of the test that can be filmed as they went.
+FILMED = 3
+
+
+class Trace(NamedTuple):
+    """What is kept of states `[B]`, so that an episode can be drawn and filmed."""
+
+    way: jax.Array
+    physics: Any
+
+
+def way_and_physics(state: State) -> Trace:
+    """Keeps o and the physics."""
+    return Trace(state.position, state.physics)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,18 +128,32 @@ class Cell(abc.ABC, Generic[M]):
 
     def _tested(self, stage: Stage, bank: Scenarios) -> dict[str, Any]:
         model, walks = self.controller(), tours(self.robot)
-        outcome, ways = run(
+        shown = walks.yaw.size
+        outcome, traces = run(
             self.robot, model, flatten(walks, bank), self.test,
-            traced=walks.yaw.size, stage=stage,
+            traced=shown + min(FILMED, bank.shape[1]), watch=way_and_physics, stage=stage,
         )  # fmt: skip
-        rest = jax.tree.map(lambda x: np.asarray(x)[walks.yaw.size :], outcome)
-        save_test(stage, episodes(rest, bank.shape), ways)
+        rest = jax.tree.map(lambda x: np.asarray(x)[shown:], outcome)
+        ways = [trace.way for trace in traces[:shown]]
+        recordings = self._recordings(traces[shown:], bank.target[0])
+        save_test(stage, episodes(rest, bank.shape), ways, recordings)
         return (
             self.controller_stage.summary()
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
             | {"engine": self.robot.engine and self.robot.engine.name}
             | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
         )
+
+    def _recordings(self, traces: list[Trace], target: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """Episodes as `genidm.video` films them; none of a robot without a drawing."""
+        try:
+            poses = [self.robot.posture(trace.physics) for trace in traces]
+        except BadInput:
+            return []
+        return [
+            {"qpos": qpos, "position": np.asarray(trace.way), "target": np.asarray(at)}
+            for qpos, trace, at in zip(poses, traces, target, strict=False)
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,10 +315,24 @@ class DirectCell(Cell[Direct]):
         }
 
 
-def save_test(stage: Stage, outcome: Episodes, ways: list[np.ndarray]) -> None:
-    """Writes the outcome of a test, and the ways of its tours."""
+def save_test(
+    stage: Stage,
+    outcome: Episodes,
+    ways: list[np.ndarray],
+    recordings: Sequence[dict[str, np.ndarray]] = (),
+) -> None:
+    """Writes a test.
+
+    Args:
+      stage: whose it is.
+      outcome: of its episodes.
+      ways: of its tours (Fig. 8), `[steps + 1, 3]` each, metres.
+      recordings: of its first episodes: qpos `[steps + 1, nq]` of the robot's drawing, position
+        `[steps + 1, 3]` and target `[3]`, metres.
+    """
     tree = {
         "episodes": dataclasses.asdict(outcome),
         "ways": {str(i): w for i, w in enumerate(ways)},
+        "recordings": {str(i): recording for i, recording in enumerate(recordings)},
     }
     files.save_arrays(stage.path("episodes"), tree, {}, overwrite=True)

@@ -142,13 +142,20 @@ def saved(
 
 
 def film_cell(this: Cell[Any]) -> None:
-    """Films a cell's controller: `video.html` and, where a picture can be drawn, `video.gif`."""
+    """Films a cell's test, beside its controller.
+
+    `video.html` and, where a picture can be drawn, `video.gif`.
+    """
     from genidm import video  # nor is this
 
-    made = video.film_test(
-        this.robot, this.controller(), title=f"{this.method.name}, {this.robot.name}"
-    )
     stage = this.controller_stage
+    title = f"{this.method.name}, {this.robot.name}"
+    test = video.recorded(stage.directory, this.robot)
+    made = (
+        video.film_tested(this.robot, test, title=title)
+        if test
+        else video.film_test(this.robot, this.controller(), title=title)
+    )
     video.write(made, stage.path("video.html"))
     try:
         video.write(made, stage.path("video.gif"))

@@ -13,7 +13,8 @@ from genidm import devices, methods
 from genidm.agents.frozen import Frozen
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
-from genidm.evaluate import Test, Testing, flatten
+from genidm.evaluate import Test, flatten
+from genidm.evaluator import Evaluator
 from genidm.experiment import Options, cell
 from genidm.fit import Fit, fit
 from genidm.pairs import Pairs
@@ -50,9 +51,9 @@ def test_more_robots_at_once_where_there_is_room(accelerator):
 def test_the_test_and_the_replay_take_what_there_is_room_for(accelerator):
     bank = flatten(scenarios(ROBOT, seeds=2, episodes=3000))
     mesh = devices.mesh(jax.devices()[:1])
-    narrow = Testing(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
+    narrow = Evaluator(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
     accelerator(80 * GB)
-    wide = Testing(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
+    wide = Evaluator(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
     assert (narrow, wide) == (512, devices.BUSY)
 
 

@@ -21,7 +21,8 @@ from original_minitaur import AFTER, RECORD, actions, original
 
 from genidm import devices, symmetry
 from genidm.errors import BadInput
-from genidm.evaluate import Test, Testing, flatten
+from genidm.evaluate import Test, flatten
+from genidm.evaluator import Evaluator
 from genidm.robots import Minitaur, State, by_name
 from genidm.robots.minitaur import Physics, from_rows
 from genidm.robots.minitaur_world import (
@@ -306,7 +307,7 @@ def test_reward_is_that_of_pybullet_envs_a_second(minitaur: Minitaur) -> None:
 def test_processes_are_kept_busy_and_no_more(minitaur: Minitaur) -> None:
     """A robot whose episode is over costs a step, too: who asks for 512 gets 32 a process."""
     bank = flatten(scenarios(minitaur, seeds=1, episodes=600))
-    queue = Testing(minitaur, bank, Test(), devices.mesh(jax.devices()[:1])).start()
+    queue = Evaluator(minitaur, bank, Test(), devices.mesh(jax.devices()[:1])).start()
     assert queue.running.episode.shape == (64,)
     assert minitaur.at_once(10) == 10
 

@@ -22,12 +22,12 @@ from genidm import methods, robots, video
 from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.experiment import Options, guarded, run_cell
-from genidm.files import save_json
+from genidm.files import load_arrays, save_json
 from genidm.robots import Ant, HumanoidWorld, Logged, remade
 from genidm.robots.mujoco import Solver
 from genidm.scenarios import scenarios
 from genidm.store import Stage
-from genidm.video import Film, Shot, Take, backends, clip, shooting
+from genidm.video import Film, Shot, Take, backends, clip, recorded, shooting
 from genidm.video.__main__ import main
 from genidm.video.filming import LONGEST, robot_of
 from genidm.video.pages import FPS, contents
@@ -403,6 +403,15 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     run_cell(Drawn(), tiny(methods.RS), options)
     (path,) = tmp_path.glob("point/RS-0-*/video.html")
     beside = inside(path.read_text())
+    # They are the tested episodes themselves, all that there were.
+    (test,) = tmp_path.glob("point/test-RS-0-*")
+    outcome = load_arrays(test / "episodes")[0]["episodes"]
+    takes = video.film_tested(Drawn(), test).takes
+    assert [len(take.qpos) - 1 for take in takes] == outcome["steps"][0].tolist()
+    assert [take.fell for take in takes] == outcome["fell"][0].tolist()
+    assert contents(video.film_tested(Drawn(), test, title="RS, point")) == beside
+    assert recorded(path.parent, Drawn(), (0, 1)) == test
+    assert recorded(path.parent, Drawn(), (2,)) is None
     assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
     main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
+import numpy as np
+from mujoco.batch import Batch
 
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.collecting import record
 from experiments.benchmark.measuring import Probe, carried, timed
+from experiments.benchmark.stepping import STEPS, among, place, step_batch, walk
+from genidm import devices
 from genidm.controller import load
-from genidm.evaluate import Queue, Steering, Test, Testing, evaluate, flatten
+from genidm.engines.mujoco import MuJoCo
+from genidm.evaluate import Steering, Test, evaluate, flatten
+from genidm.evaluator import Evaluator, Queue
 from genidm.fit import fit
 from genidm.generalize import rotate
 from genidm.methods import LR
 from genidm.pairs import pairs
 from genidm.progress import METRICS, read_metrics
+from genidm.robots import State
+from genidm.robots.mujoco import MujocoRobot
+from genidm.rollout import Move, rollout
 from genidm.scenarios import Scenarios, scenarios
 from genidm.store import Stage
+
+# Steps before `retracing`'s: by then they walk.
+WARM_UP = 100
 
 
 def controller(bench: Bench) -> Steering:
@@ -34,17 +47,64 @@ def controller(bench: Bench) -> Steering:
 def evaluating(bench: Bench) -> Probe:
     """What `evaluate` does with a bank; lane-steps without an episode count too."""
     settings, bank = _test(bench)
-    testing = Testing(bench.robot, flatten(bank), settings, bench.mesh)
-    queue = testing.start()
-    program = testing.prepare(bench.once(controller), queue)
+    evaluator = Evaluator(bench.robot, flatten(bank), settings, bench.mesh)
+    queue = evaluator.start()
+    program = evaluator.prepare(bench.once(controller), queue)
 
     def step(queue: Queue) -> Queue:
         queue = program(queue)
-        return testing.start() if testing.ended(queue) == testing.total else queue
+        return evaluator.start() if evaluator.ended(queue) == evaluator.total else queue
 
     lanes = queue.running.episode.shape[0]
     call = timed(carried(step, queue), lanes * settings.chunk)
     return Probe(call, f"{lanes} lanes, {_steering(bench)}")
+
+
+def _steered(bench: Bench) -> tuple[State, jax.Array]:
+    """Robots `[B]` in the middle of their episodes, and the actions `[STEPS, B, A]` that follow."""
+    robot, model = bench.robot, bench.once(controller)
+    starts = scenarios(robot, 1, bench.options.wide)
+    keys, yaw, target = starts.keys[0], starts.yaw[0], starts.target[0]
+
+    def act(state: State, _: None) -> tuple[State, jax.Array, None]:
+        return state, model(state.observation, target - state.position), None
+
+    def watch(_: State, move: Move) -> tuple[State, jax.Array]:
+        return move.after, move.action
+
+    def walk(state: State, steps: int) -> tuple[State, jax.Array]:
+        return rollout(robot, act, watch, state, steps=steps)
+
+    middle, _ = jax.jit(walk, static_argnums=1)(jax.jit(robot.reset)(keys, yaw), WARM_UP)
+    return middle, jax.jit(walk, static_argnums=1)(middle, STEPS)[1]
+
+
+def retracing(bench: Bench) -> Probe:
+    """The limit of `evaluating`: the engine alone makes steps of the test, over and over.
+
+    Steered robots are slower to step than robots under random actions: more of their feet are
+    on the ground.
+    """
+    robot, (state, actions) = bench.robot, bench.once(_steered)
+    lanes = actions.shape[1]
+    if isinstance(robot, MujocoRobot) and isinstance(robot.engine, MuJoCo):
+        simulations = Batch(robot.mj_model, lanes, nthread=robot.engine.threads)
+        given = np.asarray(actions, np.float64)
+
+        def call() -> None:
+            place(simulations, state.physics)
+            step_batch(robot, simulations, given)
+
+    else:
+        mesh = bench.mesh
+        program = jax.jit(devices.over_lanes(functools.partial(walk, robot), mesh, [0, 1], 0))
+        there = devices.put(state, mesh), devices.put(actions, mesh, 1)
+
+        def call() -> None:
+            jax.block_until_ready(program(*there))
+
+    note = f"{lanes} lanes, {among(robot, bench.mesh)}, {_steering(bench)}"
+    return Probe(timed(call, lanes * STEPS), note)
 
 
 def lane_steps(bench: Bench) -> tuple[float, float]:

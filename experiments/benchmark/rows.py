@@ -15,7 +15,7 @@ from experiments.benchmark.collecting import (
     writing,
 )
 from experiments.benchmark.comparing import Row
-from experiments.benchmark.evaluating import evaluating, tested
+from experiments.benchmark.evaluating import evaluating, retracing, tested
 from experiments.benchmark.fitting import fitting, multiplying
 from experiments.benchmark.others import baseline, envpool
 from experiments.benchmark.replaying import generalizing
@@ -36,6 +36,7 @@ _P = functools.partial  # one object a build: rows that share it share what it c
 _MJX = _P(stepping, engine="mjx")
 # The limit for all that steps the robot: its own engine alone, whichever that is.
 _OWN, _OWN_WIDE = "own engine, raw", "own engine, raw, wide"
+_STEERED = "own engine, raw, steered"
 _PPO = _P(collecting, method=RL)
 _WALKER = _of_humanoid("RL")
 assert isinstance(_WALKER.agent, Frozen)
@@ -100,7 +101,8 @@ _STEPPING = (
 _RUNNING = (
     Row("𝒢", "steps/s", _P(generalizing), _OWN_WIDE),
     Row("𝒢, its program alone", "steps/s", _P(generalizing, program_alone=True), _OWN_WIDE),
-    Row("evaluation", "lane-steps/s", evaluating, _OWN_WIDE),
+    Row(_STEERED, "steps/s", retracing),
+    Row("evaluation", "lane-steps/s", evaluating, _STEERED),
     Row("evaluation, all", "lane-steps", _P(tested, useful=False), rounds=1),
     Row("evaluation, useful", "lane-steps", _P(tested, useful=True), "evaluation, all", 1),
 )

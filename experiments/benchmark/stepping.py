@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
 from genidm.config import plain
+from genidm.engines.base import Physics
 from genidm.engines.mujoco import MuJoCo
 from genidm.robots import Robot, State, remade
 from genidm.robots.mujoco import MujocoRobot
@@ -34,16 +37,23 @@ def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Pr
     if threads > devices.cores():
         raise Skip(f"{threads} threads need as many cores, and there are {devices.cores()}")
     simulations = Batch(robot.mj_model, lanes, nthread=threads)
-    physics = _standing(robot, lanes).physics
-    simulations.qpos, simulations.qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
+    place(simulations, _standing(robot, lanes).physics)
     actions = np.asarray(_actions(robot, lanes), np.float64)
-
-    def call() -> None:
-        for action in actions:
-            simulations.ctrl = action
-            simulations.step(nstep=robot.frames)
-
+    call = functools.partial(step_batch, robot, simulations, actions)
     return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {counted(threads, 'thread')}")
+
+
+def place(simulations: Batch, physics: Physics) -> None:
+    """Sets the state of every simulation."""
+    simulations.qpos, simulations.qvel = np.asarray(physics.qpos), np.asarray(physics.qvel)
+    simulations.qacc_warmstart = np.asarray(physics.warmstart)
+
+
+def step_batch(robot: MujocoRobot, simulations: Batch, actions: np.ndarray) -> None:
+    """The control steps of actions `[T, B, A]`, by `mujoco.batch` and nothing else."""
+    for action in actions:
+        simulations.ctrl = action
+        simulations.step(nstep=robot.frames)
 
 
 def stepping(
@@ -65,12 +75,15 @@ def stepping(
         raise Skip(f"{lanes} lanes cannot be shared among {mesh.size} devices")
     actions = devices.put(_actions(robot, lanes), mesh, 1)
 
-    def walk(state: State, actions: jax.Array) -> State:
-        return jax.lax.scan(lambda s, a: (robot.step(s, a), None), state, actions)[0]
-
-    program = jax.jit(devices.over_lanes(walk, mesh, [0, 1], 0), donate_argnums=0)
+    sharded = devices.over_lanes(functools.partial(walk, robot), mesh, [0, 1], 0)
+    program = jax.jit(sharded, donate_argnums=0)
     call = carried(lambda s: program(s, actions), devices.put(_standing(robot, lanes), mesh))
-    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {_among(robot, mesh)}")
+    return Probe(timed(call, lanes * STEPS), f"{lanes} lanes, {among(robot, mesh)}")
+
+
+def walk(robot: Robot, state: State, actions: jax.Array) -> State:
+    """The control steps of actions `[T, B, A]`."""
+    return jax.lax.scan(lambda s, a: (robot.step(s, a), None), state, actions)[0]
 
 
 def limit(bench: Bench, *, wide: bool = False) -> Probe:
@@ -98,7 +111,7 @@ def on_engine(bench: Bench, name: str) -> Robot:
     return remade(plain(robot.settings) | {"engine": name})
 
 
-def _among(robot: Robot, mesh: Mesh) -> str:
+def among(robot: Robot, mesh: Mesh) -> str:
     """Which threads or devices share the lanes, in words."""
     if isinstance(robot.engine, MuJoCo):
         return counted(robot.engine.threads, "thread")

@@ -17,7 +17,8 @@ from experiments.benchmark.measuring import carried
 from experiments.gpu.results import Row
 from genidm import devices
 from genidm.controller import Controller
-from genidm.evaluate import Queue, Test, Testing, flatten
+from genidm.evaluate import Test, flatten
+from genidm.evaluator import Evaluator, Queue
 from genidm.methods import LR
 from genidm.models import Architecture
 from genidm.replaying import Runner
@@ -84,7 +85,7 @@ def generalizing(robot: Robot, lanes: int) -> Probe:
 def testing(robot: Robot, lanes: int) -> Probe:
     """The test with an untrained LR; a scenario for each lane, so that all have one."""
     bank = flatten(scenarios(robot, 1, lanes))
-    test = Testing(robot, bank, Test(lanes=lanes, chunk=STEPS), robot.mesh())
+    test = Evaluator(robot, bank, Test(lanes=lanes, chunk=STEPS), robot.mesh())
     queue = test.start()
     program = test.prepare(_untrained(robot), queue)
 

@@ -15,7 +15,7 @@ from genidm.errors import BadInput
 from genidm.files import save_bytes, save_text
 from genidm.video.backends import backend
 from genidm.video.clip import encoder, gif, mp4
-from genidm.video.filming import Film, Take, film, film_run, film_test
+from genidm.video.filming import Film, Take, film, film_run, film_test, film_tested, recorded
 from genidm.video.pages import Page, page
 from genidm.video.shooting import Shot, frames
 
@@ -63,7 +63,9 @@ __all__ = [
     "film",
     "film_run",
     "film_test",
+    "film_tested",
     "frames",
     "page",
+    "recorded",
     "write",
 ]

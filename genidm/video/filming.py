@@ -15,7 +15,7 @@ import numpy as np
 from genidm import controller
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test
-from genidm.files import Torn, load_json
+from genidm.files import Torn, load_arrays, load_json
 from genidm.robots import Robot, State, by_name, remade
 from genidm.scenarios import scenarios
 from genidm.store import Stage
@@ -155,8 +155,8 @@ def film_test(
 ) -> Film:
     """Episodes of the test (A.1.3), from the same starts to the same targets.
 
-    Float sums depend on how many robots walk at once, and walking is chaotic: after some
-    seconds a film may go another way than the test went.
+    It walks anew. Float sums depend on how many robots walk at once, and walking is chaotic:
+    after some seconds a film may go another way than the test went (see `film_tested`).
 
     Args:
       robot: what walks.
@@ -175,6 +175,48 @@ def film_test(
     settings = Follow(steps(robot, seconds, test.max_steps), test.reach)
     keys, yaw, target = (x[0, np.asarray(episodes)] for x in (bank.keys, bank.yaw, bank.target))
     return film(robot, steering, target[:, None], keys, yaw, settings, title, quiet=quiet)
+
+
+def film_tested(
+    robot: Robot,
+    test: Path,
+    episodes: Sequence[int] = (),
+    seconds: float = LONGEST,
+    title: str = "",
+) -> Film:
+    """Episodes of a test as they went: the recordings that the test has kept.
+
+    Args:
+      robot: what walked.
+      test: the directory of a finished test (test-METHOD-SEED-…).
+      episodes: their numbers in its first seed; all that it has recorded, unless given.
+      seconds: a longer episode is cut here.
+      title: what the film is of; the robot's name, unless given.
+
+    Raises:
+      BadInput: the robot has no drawing, or the test has not recorded the episodes.
+    """
+    drawing, settings = robot.drawing(), Stage(test).summary()["test"]
+    tree, _ = load_arrays(test / "episodes")
+    recordings, outcome = tree.get("recordings", {}), tree["episodes"]
+    most, takes = steps(robot, seconds, settings["max_steps"]), list[Take]()
+    for i in episodes or sorted(map(int, recordings)):
+        if str(i) not in recordings:
+            raise BadInput(f"{test} has no recording of episode {i}")
+        made = recordings[str(i)]
+        last = len(made["qpos"]) - 1
+        reached, fell = (bool(outcome[name][0, i]) and last <= most for name in ("reached", "fell"))
+        takes.append(
+            Take(
+                qpos=made["qpos"][: most + 1],
+                position=made["position"][: most + 1],
+                waypoints=made["target"][None],
+                arrival=np.asarray([last if reached else -1]),
+                fell=fell,
+                control_step=robot.control_step,
+            )
+        )
+    return Film(title or robot.name, drawing, takes, settings["reach"])
 
 
 def film_run(
@@ -203,11 +245,33 @@ def film_run(
     summary, robot = Stage(run).summary(), robot_of(run, engine)
     steering, title = controller.load(run, robot), f"{summary['method']}, {robot.name}"
     if waypoints is None:
+        test = recorded(run, robot, episodes) if seed == 0 else None
+        if test:
+            return film_tested(robot, test, episodes, seconds, title)
         return film_test(robot, steering, episodes or EPISODES, seed, seconds, title)
     starts = episodes or (0,)
     keys = jax.random.split(jax.random.key(seed), count_to(starts))[np.asarray(starts)]
     settings = Follow(steps(robot, seconds, Follow.max_steps), reach)
     return film(robot, steering, waypoints, keys, jnp.zeros(len(keys)), settings, title)
+
+
+def recorded(run: Path, robot: Robot, episodes: Sequence[int] = ()) -> Path | None:
+    """The newest test of a run, on the robot's engine, that has recorded some episodes.
+
+    Args:
+      run: the directory of a fit or a baseline.
+      robot: what walks.
+      episodes: those that it must have recorded; any, unless given.
+    """
+    engine = robot.engine and robot.engine.name
+    done = sorted(run.resolve().parent.glob("test-*/done.json"), key=lambda p: p.stat().st_mtime)
+    for path in reversed(done):
+        summary = load_json(path)
+        if (summary["fit"], summary["engine"]) == (run.resolve().name, engine):
+            kept = load_arrays(path.parent / "episodes", mmap=True)[0].get("recordings", {})
+            if kept and all(str(i) in kept for i in episodes):
+                return path.parent
+    return None
 
 
 def count_to(episodes: Sequence[int]) -> int:
