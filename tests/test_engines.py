@@ -15,6 +15,8 @@ import pytest
 from in_c import step_in_c
 
 from genidm import engines
+from genidm.agents.ppo import PPO
+from genidm.collect import collect
 from genidm.engines import ENGINES, Physics, Stepped
 from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
@@ -285,3 +287,15 @@ def test_an_unknown_engine_is_refused() -> None:
         engines.choose("warp", Ant.engines, "ant")
     with pytest.raises(BadInput, match=sentence):
         by_name("ant", "warp")
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_a_record_does_not_depend_on_the_threads(threads: int) -> None:
+    """Through a whole stage: PPO walks and learns on MuJoCo in C."""
+    agent, records = PPO(lanes=12, unroll=8, minibatches=2, epochs=1), []
+    for count in (1, threads):
+        robot = Ant(engine="mujoco")
+        assert isinstance(robot.engine, MuJoCo)
+        robot.engine.threads = count
+        records.append(collect(robot, agent, 3 * 12 * 8, quiet=True)[0])
+    bits.same(*records)
