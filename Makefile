@@ -54,8 +54,8 @@ format: $(STAMP)  ## mend what the linter can, and bring every file into its for
 test: $(STAMP)  ## the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist loadfile
 
-test-all: $(STAMP)  ## the slow tests too
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+test-all: $(STAMP)  ## the slow tests too, compiled as users' programs are
+	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 clean:  ## remove .venv, caches and build outputs; runs/ stays
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache build dist genidm.egg-info

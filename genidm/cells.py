@@ -140,7 +140,7 @@ class Cell(abc.ABC, Generic[M]):
         return (
             self.controller_stage.summary()
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
-            | {"engine": self.robot.engine and self.robot.engine.name}
+            | {"engine": self.robot.engine_name}
             | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
         )
 

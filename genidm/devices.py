@@ -58,7 +58,7 @@ def spread() -> None:
     try:
         _make(cores())
     except RuntimeError:
-        if jax.default_backend() == "cpu" and jax.device_count() < cores():
+        if not accelerated() and jax.device_count() < cores():
             print(
                 f"warning: MJX uses {jax.device_count()} of {cores()} cores, as jax was at work "
                 f"before it was chosen; GENIDM_DEVICES={cores()} gives it all",
@@ -97,6 +97,11 @@ def mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
         axis_types=(jax.sharding.AxisType.Auto,),
         devices=devices,
     )
+
+
+def accelerated() -> bool:
+    """Whether jax runs on something else than a CPU."""
+    return jax.default_backend() != "cpu"
 
 
 def memory() -> int | None:

@@ -184,7 +184,7 @@ def write_report(this: Cell[Any], bank: Scenarios, options: Options) -> Path:
 def announce(robot: Robot, engine: str | None) -> None:
     """Says on stderr what steps a robot and, if the user named no `engine`, why."""
     if robot.engine:
-        where = "an accelerator" if devices.memory() else "no accelerator"
+        where = "an accelerator" if devices.accelerated() else "no accelerator"
         others = " or ".join(name for name in robot.engines if name != robot.engine.name)
         why = f": jax has {where}; --engine {others} instead" if engine is None and others else ""
         print(f"{robot.name} on {robot.engine}{why}", file=sys.stderr)

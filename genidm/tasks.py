@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from genidm.errors import BadInput
-from genidm.robots.base import Robot, State, select
+from genidm.robots.base import Robot, State
 from genidm.symmetry import horizontal
 
 
@@ -84,10 +84,6 @@ class Step(flax.struct.PyTreeNode):
     def first(self) -> jax.Array:
         """`[B]` bool, `before` is the start of an episode."""
         return self.age == 0
-
-    def displacement(self, state: State) -> Any:
-        """From a state to the goal `[B, 3]`, metres; None where there is none."""
-        return None if self.goal is None else self.goal - state.position
 
 
 class Task(Protocol):
@@ -319,13 +315,6 @@ def to_step(
     )
 
 
-def advance(task: Task, robot: Robot, lanes: Lanes, action: jax.Array) -> tuple[Lanes, Step]:
-    """One step of every lane under `[B, A]`; where an episode ended, a fresh one is drawn."""
-    step = task.judge(robot, lanes, action, robot.step(lanes.robots, action))
-    going = lanes.replace(robots=step.after, age=lanes.age + 1)
-    return select(step.last, task.start(robot, lanes.keys), going), step
-
-
 def _common(step: Step) -> dict[str, jax.Array]:
     return {
         "reward": step.reward,
@@ -347,9 +336,3 @@ def input_size(robot: Robot, task: Task) -> int:
 def outlook(step: Verdict | Step, discount: float) -> jax.Array:
     """Reward `[...]` of a step and, if it is terminal, of all that would follow it."""
     return step.reward + step.terminal * step.rest * discount / (1 - discount)
-
-
-def split(lanes: Lanes) -> tuple[Lanes, Any]:
-    """Draws one key a lane `[B]` from the lanes' own streams."""
-    streams = jax.vmap(jax.random.split)(lanes.keys)
-    return lanes.replace(keys=streams[:, 0]), streams[:, 1]

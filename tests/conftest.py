@@ -10,6 +10,9 @@ from collections.abc import Iterator
 os.environ["GENIDM_DEVICES"] = "2"
 # Tests compile hundreds of small programs, and most of them again in every run.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+# Most of a test's time is compiling, which takes half as long so. `make test-all` compiles as
+# users do.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
 import pytest

@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
+from one_step import advance
 from scipy.spatial.transform import Rotation
 
 from genidm import symmetry
 from genidm.engines import Physics
 from genidm.robots import Ant, State
 from genidm.robots.mujoco import mirror_of
-from genidm.tasks import Lanes, Step, WalkForward, advance
+from genidm.tasks import Lanes, Step, WalkForward
 
 LANES = 32
 

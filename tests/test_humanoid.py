@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
+from one_step import advance
 from scipy.spatial.transform import Rotation
 
 from experiments.humanoid_world import in_world
 from genidm.engines import Physics
 from genidm.robots import Humanoid, HumanoidWorld
 from genidm.robots.humanoid import POWER
-from genidm.tasks import WalkForward, advance
+from genidm.tasks import WalkForward
 
 LANES = 16
 

@@ -47,6 +47,7 @@ models
 controller
 fit
 scenarios
+evaluator
 evaluate
 invariance waypoints
 stats

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 from bits import same
+from one_step import advance
 from original_minitaur import AFTER, RECORD, actions, original
 
 from genidm import devices, symmetry
@@ -36,7 +37,7 @@ from genidm.robots.minitaur_world import (
     stepped,
 )
 from genidm.scenarios import scenarios
-from genidm.tasks import WalkForward, advance
+from genidm.tasks import WalkForward
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no wheel of it here")
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from one_step import advance, split
 from point import Point, Straight
 
 from genidm.errors import BadInput
@@ -21,11 +22,9 @@ from genidm.tasks import (
     Sparse,
     Step,
     WalkForward,
-    advance,
     input_size,
     inputs,
     outlook,
-    split,
 )
 
 # It arrives, it falls, it diverges beyond that, and it runs into the time limit.
@@ -222,7 +221,7 @@ def test_no_fall_is_a_way_out() -> None:
 
 def test_a_policy_is_fed_the_way_to_the_goal_where_there_is_one() -> None:
     step = walked()["progress"]
-    fed = np.asarray(inputs(step.after.observation, step.displacement(step.after)))
+    fed = np.asarray(inputs(step.after.observation, step.goal - step.after.position))
     size = ROBOT.observation.size
     assert fed.shape == (STEPS, LANES, input_size(ROBOT, TASK)) == (STEPS, LANES, size + 3)
     np.testing.assert_array_equal(fed[..., :size], step.after.observation)

@@ -36,7 +36,7 @@ def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
     """What is compiled when a command is started first, and when it is started again."""
     environment = os.environ | {"XDG_CACHE_HOME": str(bench.scratch / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    engine = bench.robot.engine and bench.robot.engine.name
+    engine = bench.robot.engine_name
     code = f"from {__name__} import start; start({bench.robot.name!r}, {engine!r})"
     command = [sys.executable, "-c", code]
 

@@ -182,7 +182,7 @@ class Measuring:
 
     def _measure(self, todo: list[str], lanes: int) -> None:
         """Compiles all, side by side where there are cores for that, and then times each."""
-        workers = 1 if jax.default_backend() == "cpu" else WORKERS
+        workers = WORKERS if devices.accelerated() else 1
         with ThreadPoolExecutor(workers) as pool:
             ready = list(pool.map(lambda what: _build(what, self._robot, lanes), todo))
         for what, built in zip(todo, ready, strict=True):

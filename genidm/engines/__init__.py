@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import mujoco
 
+from genidm import devices
 from genidm.engines.base import Engine, Physics, Stepped
 from genidm.engines.mjx import MJX
 from genidm.engines.mujoco import MuJoCo
@@ -30,8 +30,8 @@ def choose(name: str | None, offered: Sequence[str], robot: str) -> str:
       BadInput: the robot is not stepped by that engine.
     """
     if name is None:
-        accelerated = jax.default_backend() != "cpu"
-        fit = [x for x in offered if x in ENGINES and ENGINES[x].on_accelerator == accelerated]
+        on = devices.accelerated()
+        fit = [x for x in offered if x in ENGINES and ENGINES[x].on_accelerator == on]
         return (fit or list(offered))[0]
     if name not in offered:
         raise BadInput(f"the {robot} is stepped by {' or '.join(offered)}, not by {name!r}")

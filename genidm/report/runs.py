@@ -122,11 +122,10 @@ def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) 
 
 def _finished(robot: Robot, root: Path, scale: str, settings: Test) -> Iterator[Tested]:
     """All finished tests at a scale, on the robot's engine, oldest first."""
-    engine = robot.engine and robot.engine.name
     done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
     for path in done:
         summary = files.load_json(path)
-        asked = (scale, plain(settings), engine)
+        asked = (scale, plain(settings), robot.engine_name)
         if (summary["scale"], summary["test"], summary.get("engine")) == asked:
             yield Tested(path.parent, summary)
 

@@ -49,7 +49,7 @@ def report(
     shown = gather(runs)
     rows = [runs.row(name, shown.invariance(name)) for name in runs.found]
     written = _document(runs, rows, scale)
-    engine = f"-{robot.engine.name}" if len(robot.engines) > 1 and robot.engine else ""
+    engine = f"-{robot.engine_name}" if len(robot.engines) > 1 else ""
     here = root / f"report-{scale}{engine}"
     _write(here, "", "results.json", written, rows, shown)
     if results:

@@ -122,6 +122,11 @@ class Robot(abc.ABC):
         """
         return self.engine.at_once(lanes) if self.engine else devices.at_once(lanes)
 
+    @property
+    def engine_name(self) -> str | None:
+        """As `--engine` takes it; None if the robot steps itself."""
+        return self.engine.name if self.engine else None
+
     def mesh(self) -> Mesh:
         """The jax devices that share its lanes, unless the caller names others."""
         return self.engine.mesh() if self.engine else devices.mesh()

@@ -263,11 +263,10 @@ def recorded(run: Path, robot: Robot, episodes: Sequence[int] = ()) -> Path | No
       robot: what walks.
       episodes: those that it must have recorded; any, unless given.
     """
-    engine = robot.engine and robot.engine.name
     done = sorted(run.resolve().parent.glob("test-*/done.json"), key=lambda p: p.stat().st_mtime)
     for path in reversed(done):
         summary = load_json(path)
-        if (summary["fit"], summary["engine"]) == (run.resolve().name, engine):
+        if (summary["fit"], summary["engine"]) == (run.resolve().name, robot.engine_name):
             kept = load_arrays(path.parent / "episodes", mmap=True)[0].get("recordings", {})
             if kept and all(str(i) in kept for i in episodes):
                 return path.parent
