@@ -11,10 +11,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import glob
+import hashlib
 import json
 import os
+import platform
 import re
+import secrets
 import shutil
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -28,6 +33,9 @@ from genidm.errors import BadInput
 
 MANIFEST = "manifest.json"
 _SCRATCH = ".genidm-tmp"
+_OLD = f".old.*{_SCRATCH}"
+# Seconds after which nobody is still writing what was begun.
+_ABANDONED = 24 * 3600.0
 
 
 class Torn(BadInput):
@@ -52,14 +60,35 @@ def disk(path: Path | str) -> Iterator[None]:
 
 
 def _scratch(path: Path, use: str) -> Path:
-    """A free name beside `path`; what killed processes left there is removed."""
+    """A new name beside `path`, for "new", "old" or "gone"; what killed runs left there goes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".*{_SCRATCH}"):
-        if not _alive(int(left.stem.rpartition(".")[2])):
+        name, old, _ = left.name[1:].rpartition(".old.")
+        only_version = old and not left.with_name(name).exists()
+        if _abandoned(left) and not only_version:
             _delete(left)
-    name = path.with_name(f".{path.name}.{use}.{os.getpid()}{_SCRATCH}")
-    _delete(name)
-    return name
+    token = secrets.token_hex(4)
+    return path.with_name(f".{path.name}.{use}.{_here()}.{os.getpid()}.{token}{_SCRATCH}")
+
+
+@functools.cache
+def _here() -> str:
+    """Names the process ids that can be told apart from here: two containers may have one each."""
+    parts = [platform.node()]
+    with contextlib.suppress(OSError):
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text())
+        parts.append(os.readlink("/proc/self/ns/pid"))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
+
+
+def _abandoned(left: Path) -> bool:
+    """Whether nobody writes it any more: its process is dead, or it is a day old."""
+    *_, here, process, _token, _suffix = left.name.split(".")
+    try:
+        old = time.time() - left.stat().st_mtime > _ABANDONED
+        return old or (here == _here() and process.isdecimal() and not _alive(int(process)))
+    except FileNotFoundError:
+        return False
 
 
 def _alive(process: int) -> bool:
@@ -77,6 +106,15 @@ def _delete(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def _recover(path: Path) -> None:
+    """Brings back the old version of a directory, if a kill has left no new one in its place."""
+    if not path.exists():
+        for old in path.parent.glob(f".{glob.escape(path.name)}{_OLD}"):
+            if _complete(old):
+                old.rename(path)
+                return
+
+
 def remove(path: Path) -> None:
     """Removes a directory, if it is there, so that a kill leaves no half of it under its name.
 
@@ -84,8 +122,7 @@ def remove(path: Path) -> None:
       OSError: it cannot be removed; `disk` around the call says so in a sentence.
     """
     if path.exists():
-        away = path.rename(_scratch(path, "old"))
-        _delete(away)
+        _delete(path.rename(_scratch(path, "gone")))
 
 
 def _sync(path: Path) -> None:
@@ -135,26 +172,69 @@ def load_json(path: Path | str) -> Any:
 def building(path: Path) -> Iterator[Path]:
     """A directory to fill, which then takes the place of `path`, with a manifest.
 
-    An error while it is filled leaves `path` as it was.
+    An error while it is filled leaves `path` as it was. A kill leaves the old version or the
+    new one: `verify` brings back an old one that was moved away when the kill came.
 
     Raises:
-      BadInput: the disk is full, or `path` cannot be written.
+      BadInput: the disk is full, `path` cannot be written, or it holds what its manifest does
+        not list.
     """
     with disk(path):
+        _recover(path)
+        _only_ours(path)
         scratch = _scratch(path, "new")
         try:
             scratch.mkdir()
             yield scratch
             entries = sorted(scratch.rglob("*"))
+            if not entries:
+                raise BadInput(f"{scratch} has vanished while it was written")
             for entry in entries:
                 _sync(entry)
             files = {str(p.relative_to(scratch)): _measure(p) for p in entries if p.is_file()}
             save_json(scratch / MANIFEST, files)
-            remove(path)
-            scratch.rename(path)
-            _sync(path.parent)
+            _install(scratch, path)
         finally:
             _delete(scratch)
+
+
+def _install(scratch: Path, path: Path) -> None:
+    """Puts a directory in the place of another: that is moved away, and deleted afterwards."""
+    if path.exists():
+        old = path.rename(_scratch(path, "old"))
+        try:
+            scratch.rename(path)
+        except OSError:
+            old.rename(path)
+            raise
+    else:
+        scratch.rename(path)
+    _sync(path.parent)
+    for old in path.parent.glob(f".{glob.escape(path.name)}{_OLD}"):
+        _delete(old)
+
+
+def _only_ours(path: Path) -> None:
+    """Refuses a directory with files that are not in its manifest."""
+    if not path.exists() or not any(path.iterdir()):
+        return
+    try:
+        listed = {MANIFEST, *_manifest(path)}
+    except Torn:
+        listed = set()
+    for file in sorted(path.rglob("*")):
+        name = str(file.relative_to(path))
+        if file.is_file() and name not in listed and not name.endswith(_SCRATCH):
+            raise BadInput(f"{path} holds something else ({name}), and is not overwritten")
+
+
+def _manifest(directory: Path) -> dict[str, list[int]]:
+    """Size and crc32 of each file; raises Torn if there is no such list."""
+    files = load_json(directory / MANIFEST)
+    measures = files.values() if isinstance(files, dict) else [None]
+    if not all(isinstance(m, list) and [type(x) for x in m] == [int, int] for m in measures):
+        raise Torn(f"{directory / MANIFEST} is no list of files")
+    return files
 
 
 def _measure(file: Path) -> list[int]:
@@ -169,9 +249,10 @@ def verify(directory: Path | str) -> list[str]:
     """The files of a complete directory; raises Torn if it is not."""
     directory = Path(directory)
     with disk(directory):
+        _recover(directory)
         if not directory.exists():
             raise Torn(f"{directory} is missing")
-        files: dict[str, list[int]] = load_json(directory / MANIFEST)
+        files = _manifest(directory)
         for name, measure in files.items():
             if not (directory / name).is_file():
                 raise Torn(f"{directory} is torn: {name} is missing")
@@ -202,9 +283,6 @@ def save_arrays(path: Path | str, tree: Any, meta: Any, overwrite: bool = False)
     path, arrays = Path(path), {name: as_array(name, x) for name, x in _dotted(tree)}
     if not overwrite and _complete(path):
         raise BadInput(f"{path} is there already, and is not overwritten")
-    with disk(path):
-        if path.exists() and any(path.iterdir()) and not (path / MANIFEST).exists():
-            raise BadInput(f"{path} holds something else, and is not overwritten")
     with building(path) as scratch:
         for name, array in arrays.items():
             np.save(scratch / f"{name}.npy", array, allow_pickle=False)

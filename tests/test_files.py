@@ -53,7 +53,10 @@ def test_torn_arrays_are_recognised_and_replaced(tmp_path: Path, name: str, harm
     harm(tmp_path / "x" / name)
     with pytest.raises(Torn, match=r"torn|missing"):
         load_arrays(tmp_path / "x")
-    if name != "manifest.json" or harm is not Path.unlink:
+    if name == "manifest.json" and harm is not flip:  # nobody knows then whose files they are
+        with pytest.raises(BadInput, match="something else"):
+            save_arrays(tmp_path / "x", TREE, {"again": True}, overwrite=True)
+    else:
         save_arrays(tmp_path / "x", TREE, {"again": True})
         assert load_arrays(tmp_path / "x")[1] == {"again": True}
 
@@ -78,6 +81,59 @@ def test_a_directory_of_something_else_is_never_replaced(tmp_path: Path) -> None
     with pytest.raises(BadInput, match="something else"):
         save_arrays(tmp_path, TREE, {}, overwrite=True)
     assert (tmp_path / "thesis.tex").exists()
+
+
+def test_files_that_a_user_put_beside_ours_are_never_removed(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", TREE, 1)
+    (tmp_path / "x" / "notes.txt").write_text("seed 3 walks best")
+    with pytest.raises(BadInput, match=r"holds something else \(notes.txt\)"):
+        save_arrays(tmp_path / "x", TREE, 2, overwrite=True)
+    assert load_arrays(tmp_path / "x")[1] == 1 and (tmp_path / "x" / "notes.txt").exists()
+
+
+@pytest.mark.parametrize("manifest", ['{"name": "app", "icons": []}', "[1, 2]", '{"a.npy": [1]}'])
+def test_a_manifest_of_another_program_makes_a_directory_not_ours(
+    tmp_path: Path, manifest: str
+) -> None:
+    (tmp_path / "manifest.json").write_text(manifest)
+    (tmp_path / "index.html").write_text("a web app")
+    for overwrite in (False, True):
+        with pytest.raises(BadInput, match=r"something else \(index.html\)"):
+            save_arrays(tmp_path, TREE, {}, overwrite=overwrite)
+    assert (tmp_path / "manifest.json").read_text() == manifest
+
+
+def test_an_old_version_comes_back_where_a_kill_left_no_new_one(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", TREE, 1)
+    (tmp_path / "x").rename(files._scratch(tmp_path / "x", "old"))
+    save_arrays(tmp_path / "y", TREE, 2)  # tidies up, but not the only version of x
+    assert load_arrays(tmp_path / "x")[1] == 1
+    (tmp_path / "x").rename(files._scratch(tmp_path / "x", "old"))
+    with pytest.raises(BadInput, match="there already"):
+        save_arrays(tmp_path / "x", TREE, 3)
+    assert load_arrays(tmp_path / "x")[1] == 1
+
+
+def test_what_another_container_is_writing_stays(tmp_path: Path, monkeypatch) -> None:
+    """Its process ids are not ours: one that is dead here may be at work there."""
+    dead = 2**22 + 1
+    monkeypatch.setattr(os, "getpid", lambda: dead)
+    monkeypatch.setattr(files, "_here", lambda: "elsewhere")
+    theirs = files._scratch(tmp_path / "x", "new")
+    monkeypatch.undo()
+    theirs.mkdir()
+    save_arrays(tmp_path / "y", TREE, 1)
+    assert theirs.exists()
+    os.utime(theirs, (0, 0))  # for so long nobody writes
+    save_arrays(tmp_path / "y", TREE, 2, overwrite=True)
+    assert not theirs.exists()
+
+
+def test_a_directory_that_vanishes_while_it_is_written_is_not_installed(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", TREE, 1)
+    with pytest.raises(BadInput, match="has vanished"), files.building(tmp_path / "x") as scratch:
+        scratch.rmdir()
+    assert load_arrays(tmp_path / "x")[1] == 1
 
 
 @pytest.mark.parametrize(
