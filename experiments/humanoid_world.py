@@ -47,7 +47,7 @@ def record(options: table1.Table) -> Experience:
     def work() -> dict[str, Any]:
         seen = source.experience()
         seen = seen.replace(s=in_world(seen.s))
-        seen.save(stage.path("experience") / "chunk_00000")
+        seen.save(stage.path("experience") / "chunk_00000", overwrite=True)
         return source.experience_stage.summary()
 
     stage.once(work)

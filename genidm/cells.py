@@ -177,14 +177,16 @@ class InverseCell(Cell[Inverse]):
         """What the agent saw while it learned (§4.1)."""
         stage = self.experience_stage
         stage.once(self._collected)
-        return experience.load_chunks(stage.path("experience"), self.robot)
+        recorded = stage.summary()["recorded"]
+        return experience.load_chunks(stage.path("experience"), self.robot, recorded)
 
     def _collected(self) -> dict[str, Any]:
         stage, (agent, before) = self.experience_stage, self._collector()
         record, policy = self._collect(stage, agent, self.scale.interactions - before)
         if policy:
             policy.save(stage.path("policy"), overwrite=True)
-        return {"interactions": before + record.interactions}
+        recorded = record.interactions
+        return {"interactions": before + recorded, "recorded": recorded}
 
     def _collector(self) -> tuple[Agent, int]:
         """What collects, and for how many interactions it has learned before."""

@@ -115,7 +115,7 @@ class _Log:
             self.chunks.append(concatenate(self.parts))
             self.parts = []
         if self.stage and self.keep:
-            self.chunks[-1].save(self._path(len(self.chunks) - 1))
+            self.chunks[-1].save(self._path(len(self.chunks) - 1), overwrite=True)
         if self.stage:
             state = {"learner": learner, "chunks": len(self.chunks)}
             self.stage.checkpoints().save(iteration, state)

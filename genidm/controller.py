@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import files, symmetry
-from genidm.agents.policy import Policy
+from genidm.agents.policy import Policy, described
 from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.models import Architecture
@@ -85,7 +85,16 @@ class Controller(flax.struct.PyTreeNode):
         """Unclipped actions of states and directions in the method's frame (Eq. 1, 4)."""
         return self.architecture.action(self.params, self.latent(s, d))
 
-    def save(self, path: Path, overwrite: bool = False) -> None:
+    def fresh(self, key: jax.Array) -> dict[str, Any]:
+        """Parameters and statistics of the shapes that these have, not yet fitted."""
+        size = self.robot.observation.size
+        return {
+            "params": self.architecture.init(key, size),
+            "mean": jnp.zeros(size),
+            "std": jnp.ones(size),
+        }
+
+    def save(self, path: Path | str, overwrite: bool = False) -> None:
         """Writes the controller as a directory, without pickle.
 
         Raises:
@@ -94,7 +103,7 @@ class Controller(flax.struct.PyTreeNode):
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
-        meta = {"robot": self.robot.name, "frame": self.frame} | plain(self.architecture)
+        meta = described(self.robot) | {"frame": self.frame} | plain(self.architecture)
         files.save_arrays(path, leaves, meta, overwrite)
 
     @classmethod
@@ -120,7 +129,9 @@ def pretrained(robot: str) -> Controller | Policy:
     return load(PRETRAINED / robot)
 
 
-def load(path: Path, robot: Robot | None = None, engine: str | None = None) -> Controller | Policy:
+def load(
+    path: Path | str, robot: Robot | None = None, engine: str | None = None
+) -> Controller | Policy:
     """A saved controller, fitted or learned.
 
     Args:
@@ -141,10 +152,52 @@ def load(path: Path, robot: Robot | None = None, engine: str | None = None) -> C
             "(METHOD-SEED-…), once that is finished"
         )
     tree, meta = files.load_arrays(place)
-    if tree.keys() != {"params", "mean", "std"}:
+    if tree.keys() != {"params", "mean", "std"} or not isinstance(meta, dict):
         raise BadInput(f"{path} holds no controller")
-    robot = robot or by_name(meta["robot"], engine)
-    if meta["robot"] != robot.name:
-        raise BadInput(f"{path} holds a controller for {meta['robot']}, not for {robot.name}")
+    robot = robot or by_name(meta.get("robot", ""), engine)
+    if meta.get("robot") != robot.name:
+        raise BadInput(f"{path} holds a controller for {meta.get('robot')}, not for {robot.name}")
+    _same_layouts(path, meta, robot)
     restore = Policy.restore if "directed" in meta else Controller.restore
-    return restore(tree, meta, robot)
+    try:
+        made = restore(tree, meta, robot)
+        wanted = jax.eval_shape(made.fresh, jax.random.key(0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"{path} holds no controller: {error}") from None
+    _as_wanted(path, {"params": made.params, "mean": made.mean, "std": made.std}, wanted)
+    return made
+
+
+def _same_layouts(path: Path | str, meta: dict[str, Any], robot: Robot) -> None:
+    """Refuses a controller that was made for other numbers, or for the same in another order."""
+    for name in ("observation", "action"):
+        there, here = meta.get(name), described(robot)[name]
+        if there != here:
+            raise BadInput(
+                f"{path} was made for another {name} of the {robot.name}: {_fields(there)} there, "
+                f"{_fields(here)} here"
+            )
+
+
+def _fields(listed: Any) -> str:
+    try:
+        return ", ".join(f"{name} ({size} × {unit}, {kind})" for name, kind, size, unit in listed)
+    except (TypeError, ValueError):
+        return "no list of fields"
+
+
+def _as_wanted(path: Path | str, found: Any, wanted: Any) -> None:
+    """Refuses parameters of other names, shapes or dtypes than the architecture's, or NaN."""
+    there, here = (
+        {jax.tree_util.keystr(k): x for k, x in jax.tree_util.tree_leaves_with_path(tree)}
+        for tree in (found, wanted)
+    )
+    for name in sorted(there.keys() | here.keys()):
+        kinds = [
+            f"{x.dtype}{list(x.shape)}" if (x := tree.get(name)) is not None else "absent"
+            for tree in (there, here)
+        ]
+        if kinds[0] != kinds[1]:
+            raise BadInput(f"{path}: {name} is {kinds[0]}, where its architecture has {kinds[1]}")
+        if not np.isfinite(there[name]).all():
+            raise BadInput(f"{path}: {name} holds NaN or infinity")

@@ -14,6 +14,7 @@ import numpy as np
 
 from genidm import files
 from genidm.errors import BadInput
+from genidm.files import Torn
 from genidm.robots.base import Robot
 from genidm.tasks import Step
 
@@ -56,40 +57,158 @@ class Experience(flax.struct.PyTreeNode):
         """What GE and LR learn from (A.1.2)."""
         return self.first_share(0.5)
 
-    def save(self, path: Path) -> None:
-        """Writes the record as a directory of arrays, without pickle."""
-        tree = flax.serialization.to_state_dict(self)
-        there = {name: x for name, x in tree.items() if x is not None}
-        files.save_arrays(path, there, {}, overwrite=True)
-
-    def check(self, robot: Robot) -> None:
-        """Refuses a record that cannot be learned from.
+    def save(self, path: Path | str, overwrite: bool = False) -> None:
+        """Writes the record as a directory of arrays, without pickle.
 
         Raises:
-          BadInput: the shapes do not fit together or the robot, numbers are not finite, actions
-            lie outside [−1, 1], a quaternion in s is none with w ≥ 0, or flags are not bool.
+          BadInput: there is a record already, and `overwrite` is not set; or one of its valid
+            steps holds what is not finite.
         """
-        lanes = np.shape(self.first)
-        if len(lanes) != 2:
-            raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
-        state, action = robot.observation, robot.action
-        sizes = {"s": (state.size,), "o": (3,), "o_next": (3,), "a": (action.size,)}
-        for name, size in (sizes | {"last": (), "valid": ()}).items():
-            shape = np.shape(getattr(self, name))
-            if shape != (*lanes, *size):
-                raise BadInput(f"experience: {name} has shape {shape}, not {(*lanes, *size)}")
-        for name in (*sizes, "physics"):
-            if not all(np.isfinite(x).all() for x in jax.tree.leaves(getattr(self, name))):
-                raise BadInput(f"experience: {name} holds NaN or infinity")
-        for name in ("first", "last", "valid"):
-            if getattr(self, name).dtype != bool:
-                raise BadInput(f"experience: {name} is of {getattr(self, name).dtype}, not bool")
-        if np.abs(self.a).max(initial=0.0) > 1 + 1e-6:
-            raise BadInput("experience: a lies outside [−1, 1]")
-        for field in state.unsound(np.asarray(self.s)):
-            raise BadInput(f"experience: {field!r} in s is not of length 1 with w ≥ 0 everywhere")
-        if any(x.shape[:2] != lanes for x in jax.tree.leaves(self.physics)):
-            raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
+        made = jax.tree.map(_plain, _named(self))
+        _finite(_cleared(made))
+        tree = flax.serialization.to_state_dict(made)
+        there = {name: x for name, x in tree.items() if x is not None}
+        files.save_arrays(path, there, {}, overwrite)
+
+    @property
+    def ends(self) -> np.ndarray:
+        """`[T, B]` bool, where an episode ends: it says so, or the next step begins one."""
+        last, first = np.asarray(self.last), np.asarray(self.first)
+        return last | np.concatenate([first[1:], np.zeros_like(first[:1])])
+
+    def prepared(self, robot: Robot) -> Experience:
+        """The record as 𝒢 and a fit can use it: NumPy arrays, and s as controllers are fed it.
+
+        Steps that are not `valid` are not looked at: what they hold is set to zero. Without
+        physics to be replayed from, positions count from the start of each episode; they are
+        subtracted in the precision that they come in, so that float64 of UTM size is no harm.
+
+        Raises:
+          BadInput: the shapes do not fit together or the robot, or what a valid step holds cannot
+            be: numbers that are not finite, actions outside [−1, 1], an orientation that is none,
+            positions that jump, episodes that begin where none has ended.
+        """
+        made = jax.tree.map(_plain, _named(self))
+        _fitting(made, robot)
+        clean = _cleared(made)
+        _finite(clean)
+        _possible(clean, robot)
+        _continuous(clean, robot)
+        if clean.physics is None:
+            clean = clean.centred()
+        narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
+        return narrow.replace(s=np.asarray(robot.observation.canonical(jnp.asarray(narrow.s))))
+
+    def centred(self) -> Experience:
+        """Positions that count from the start of each episode, horizontally."""
+        ends, o = self.ends, np.asarray(self.o)
+        begins = np.concatenate([np.ones_like(ends[:1]), ends[:-1]])
+        rows = np.arange(len(o))[:, None]
+        start = np.maximum.accumulate(np.where(begins, rows, 0), axis=0)
+        origin = np.take_along_axis(o, start[..., None], axis=0) * [1, 1, 0]
+        return self.replace(o=o - origin, o_next=np.asarray(self.o_next) - origin)
+
+
+def _plain(x: Any) -> np.ndarray:
+    """An array as NumPy computes with it, of this machine's byte order."""
+    if isinstance(x, np.ma.MaskedArray):
+        if np.ma.is_masked(x):
+            raise BadInput("experience: an array is masked: mark those steps as not valid")
+        x = x.data
+    try:
+        array = np.asarray(x)
+        if array.dtype == object:
+            array = np.asarray(array.tolist(), np.float64)
+    except (TypeError, ValueError):
+        raise BadInput("experience: an array holds something else than numbers") from None
+    if array.dtype.kind not in "biuf":
+        raise BadInput(f"experience: an array holds {array.dtype}, not numbers")
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _named(experience: Experience) -> Experience:
+    """The record with lists, which are trees to jax, as arrays."""
+    lists = {
+        f.name: np.asarray(x) if isinstance(x, list | tuple) else x
+        for f in dataclasses.fields(experience)
+        if (x := getattr(experience, f.name)) is not None or f.name == "physics"
+    }
+    return experience.replace(**lists)
+
+
+def _cleared(made: Experience) -> Experience:
+    """The record with zeros in the steps that are not valid."""
+    valid = made.valid
+    if valid.all():
+        return made
+
+    def clear(x: np.ndarray) -> np.ndarray:
+        there = valid.reshape(valid.shape + (1,) * (x.ndim - 2))
+        return x if x.dtype == bool else np.where(there, x, np.zeros_like(x))
+
+    return jax.tree.map(clear, made)
+
+
+def _fitting(made: Experience, robot: Robot) -> None:
+    """Refuses shapes and flags that do not fit together, or the robot."""
+    lanes = made.first.shape
+    if len(lanes) != 2 or 0 in lanes:
+        raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
+    sizes = {"s": (robot.observation.size,), "o": (3,), "o_next": (3,), "a": (robot.action.size,)}
+    for name, size in (sizes | {"last": (), "valid": ()}).items():
+        shape = getattr(made, name).shape
+        if shape != (*lanes, *size):
+            raise BadInput(f"experience: {name} has shape {shape}, not {(*lanes, *size)}")
+    for name in ("first", "last", "valid"):
+        if getattr(made, name).dtype != bool:
+            raise BadInput(f"experience: {name} is of {getattr(made, name).dtype}, not bool")
+    if any(x.shape[:2] != lanes for x in jax.tree.leaves(made.physics)):
+        raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
+    if not made.valid.any():
+        raise BadInput("experience: no step is valid")
+
+
+def _finite(clean: Experience) -> None:
+    for name in ("s", "o", "o_next", "a", "physics"):
+        for x in jax.tree.leaves(getattr(clean, name)):
+            if not np.isfinite(x).all():
+                t, lane = np.argwhere(~np.isfinite(x))[0][:2]
+                raise BadInput(f"experience: {name} holds NaN or infinity, first in [{t}, {lane}]")
+
+
+def _possible(clean: Experience, robot: Robot) -> None:
+    """Refuses actions and states that the robot cannot have."""
+    if np.abs(clean.a).max() > 1 + 1e-6:
+        t, lane = np.argwhere(np.abs(clean.a) > 1 + 1e-6)[0][:2]
+        raise BadInput(f"experience: a lies outside [−1, 1], first in [{t}, {lane}]")
+    for lane in range(clean.s.shape[1]):
+        rows = clean.s[clean.valid[:, lane], lane]
+        for flaw in robot.observation.flaws(rows) if len(rows) else ():
+            raise BadInput(f"experience: {flaw} (s, lane {lane})")
+
+
+def _continuous(clean: Experience, robot: Robot) -> None:
+    """Refuses flags and positions that contradict each other, or a robot that is carried away."""
+    both = clean.valid[1:] & clean.valid[:-1]
+    for wrong, what in (
+        (both & clean.first[1:] & ~clean.last[:-1], "begins an episode, where none has ended"),
+        (both & ~clean.first[1:] & clean.last[:-1], "begins none, where one has ended"),
+    ):
+        if wrong.any():
+            t, lane = np.argwhere(wrong)[0]
+            raise BadInput(f"experience: step [{t + 1}, {lane}] {what} (first, last)")
+    step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
+    usual = np.quantile(step[clean.valid], 0.99)
+    most = max(10 * usual, 5.0 * robot.control_step)
+    gap = np.linalg.norm(clean.o[1:] - clean.o_next[:-1], axis=-1) * (both & ~clean.ends[:-1])
+    for name, jump in (("o_next", step), ("o", np.concatenate([0 * gap[:1], gap]))):
+        if (jump > most).any():
+            t, lane = np.unravel_index(jump.argmax(), jump.shape)
+            raise BadInput(
+                f"experience: the position jumps by {jump.max():.3g} m to {name} [{t}, {lane}], "
+                f"where 99 % of the steps are below {usual:.2g} m: end the episode there, or mark "
+                "the step as not valid"
+            )
 
 
 def record(step: Step) -> Experience:
@@ -111,7 +230,7 @@ def concatenate(parts: list[Experience]) -> Experience:
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(p) for p in x]), *parts)
 
 
-def load(path: Path, robot: Robot) -> Experience:
+def load(path: Path | str, robot: Robot) -> Experience:
     """A record that `Experience.save` wrote.
 
     Raises:
@@ -121,7 +240,7 @@ def load(path: Path, robot: Robot) -> Experience:
     if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
         raise BadInput(f"{path} holds no experience")
     experience = Experience(**tree)
-    experience.check(robot)
+    _fitting(experience, robot)
     if experience.physics is None:
         return experience
     try:
@@ -131,9 +250,25 @@ def load(path: Path, robot: Robot) -> Experience:
     return experience.replace(physics=physics)
 
 
-def load_chunks(directory: Path, robot: Robot) -> Experience:
-    """The record that `collect` wrote in chunks."""
-    return concatenate([load(path, robot) for path in sorted(directory.glob("chunk_*"))])
+def load_chunks(directory: Path, robot: Robot, interactions: int) -> Experience:
+    """The record that `collect` wrote in chunks.
+
+    Args:
+      directory: where they lie.
+      robot: whose record it is.
+      interactions: how many there must be.
+
+    Raises:
+      BadInput: a chunk is torn, or missing.
+    """
+    chunks = [load(path, robot) for path in sorted(directory.glob("chunk_*"))]
+    found = sum(chunk.interactions for chunk in chunks)
+    if found != interactions:
+        raise Torn(
+            f"{directory} holds {found} of {interactions} interactions: a chunk is missing. "
+            f"Delete {directory.parent} to collect it anew"
+        )
+    return concatenate(chunks)
 
 
 def goal_step(last: jax.Array, look_ahead: int) -> tuple[jax.Array, jax.Array]:

@@ -83,7 +83,7 @@ def replay(
       BadInput: the record is unusable, or holds no physics and the mode needs it.
     """
     settings = (settings or Generalize()).on(robot)
-    experience.check(robot)
+    experience = experience.prepared(robot)
     if settings.mode == "rotate":
         return rotate(robot, experience, key, settings.copies)
     if experience.physics is None:
@@ -104,6 +104,7 @@ def replay(
 
 def rotate(robot: Robot, experience: Experience, key: jax.Array, copies: int = 1) -> Replay:
     """The record turned exactly, each sample by a yaw of its own, without physics."""
+    experience = experience.prepared(robot)
     shape = (copies, *experience.first.shape)
     yaw = jax.random.uniform(key, shape, minval=-jnp.pi, maxval=jnp.pi)
     turn = jax.vmap(symmetry.turn_vector, (None, 0))
@@ -129,7 +130,9 @@ def residual(experience: Experience, turned: Replay, steps: int = 200) -> dict[s
       "step" `[n]`, and "median", "p90" `[n]`: metres between o_next replayed and the
       record's own turned, over all samples that many steps after a placing.
     """
-    exact = jax.vmap(symmetry.turn_vector, (None, 0))(experience.o_next, turned.yaw)
+    record = experience if experience.physics is not None else experience.centred()
+    o_next = jnp.asarray(record.o_next, jnp.float32)
+    exact = jax.vmap(symmetry.turn_vector, (None, 0))(o_next, turned.yaw)
     distance = np.linalg.norm(np.asarray(exact) - turned.o_next, axis=-1)
     since = np.arange(distance.shape[1])[:, None] - turned.start
     rows = []

@@ -63,11 +63,12 @@ def pairs(
     """
     if look_ahead < 1:
         raise BadInput(f"look_ahead must be at least 1, not {look_ahead}")
-    experience.check(robot)
-    goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.last), look_ahead))
-    ahead = np.take_along_axis(np.asarray(experience.o_next), goal[..., None], axis=0)
-    views = [(np.asarray(experience.s), ahead - np.asarray(experience.o))]
-    valid = np.asarray(experience.valid) & exists
+    experience = experience.prepared(robot)
+    goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.ends), look_ahead))
+    ahead = np.take_along_axis(experience.o_next, goal[..., None], axis=0)
+    views = [(experience.s, ahead - experience.o)]
+    # A step that is not valid is no goal for others, either.
+    valid = experience.valid & exists & np.take_along_axis(experience.valid, goal, axis=0)
     for copy in _copies(turned):
         views.append((copy.s, _goal(copy, goal, ahead) - copy.o))
         valid = valid & copy.valid
@@ -79,7 +80,7 @@ def pairs(
             f"no episode lasts look_ahead = {look_ahead} steps: make it less "
             "(--method.look-ahead), or collect more (--scale)"
         )
-    out = _samples(views, np.asarray(experience.a), valid)
+    out = _samples(views, experience.a, valid)
     return with_reflection(robot, out) if mirror else out
 
 

@@ -84,7 +84,7 @@ class Field:
       turn: (x [..., size], yaw [...]) → x after the world is turned by yaw.
       mirror: x [..., size] → x after the reflection y → −y.
       yaw: x [..., size] → heading [...], for a field that holds one.
-      sound: x [..., size] → whether all of it can be such numbers.
+      flaw: x [..., size] on the host → why it cannot be such numbers; None if it can.
       canonical: x [..., size] → the one that stands for it, where several mean the same.
     """
 
@@ -95,7 +95,7 @@ class Field:
     turn: Turn
     mirror: Mirror
     yaw: Callable[[Array], Array] | None = None
-    sound: Callable[[np.ndarray], bool] | None = None
+    flaw: Callable[[np.ndarray], str | None] | None = None
     canonical: Callable[[Array], Array] | None = None
 
 
@@ -145,13 +145,20 @@ def quaternion(name: str) -> Field:
     """
     mirror = _signed([1, -1, 1, -1])
     return Field(
-        name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _upright_units, positive
+        name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _no_quaternion, positive
     )
 
 
-def _upright_units(q: np.ndarray) -> bool:
-    """Whether quaternions `[..., 4]` have length 1, within 1e-3, and w ≥ 0."""
-    return bool((np.abs(np.linalg.norm(q, axis=-1) - 1) < 1e-3).all() and (q[..., 0] >= 0).all())
+def _no_quaternion(q: np.ndarray) -> str | None:
+    """Why `[..., 4]` are no orientations (w, x, y, z) of a robot that stands upright at times."""
+    if (np.abs(np.linalg.norm(q, axis=-1) - 1) > 1e-3).any() or (q[..., 0] < 0).any():
+        return "is not of length 1 with w ≥ 0 everywhere"
+    if not q.size:
+        return None
+    never_upright = (1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2) <= 0).all()
+    if never_upright or (q[..., 0] < 1e-3).all():
+        return "is upside down throughout: the order is (w, x, y, z), not (x, y, z, w)"
+    return None
 
 
 def heading_vector(name: str, unit: str = "m") -> Field:
@@ -160,15 +167,29 @@ def heading_vector(name: str, unit: str = "m") -> Field:
 
 
 def euler(name: str) -> Field:
-    """An orientation as roll, pitch and yaw (about the world's x, then y, then z).
+    """An orientation as roll, pitch and yaw (about the world's x, then y, then z), in radians.
 
-    A turn changes the yaw alone.
+    A turn changes the yaw alone. An angle and the same angle a full turn on are one
+    orientation: networks are fed the one in [−π, π).
     """
 
     def turn(x: Array, yaw: Array) -> Array:
         return x.at[..., 2].set(wrap(x[..., 2] + yaw))
 
-    return Field(name, 3, "Euler angles", "rad", turn, _signed([-1, 1, -1]), lambda x: x[..., 2])
+    mirror = _signed([-1, 1, -1])
+    return Field(name, 3, "Euler angles", "rad", turn, mirror, lambda x: x[..., 2], _no_euler, wrap)
+
+
+def _no_euler(angles: np.ndarray) -> str | None:
+    """Why `[..., 3]` cannot be roll, pitch and yaw in radians; a yaw may count full turns."""
+    roll, pitch = np.abs(angles[..., 0]), np.abs(angles[..., 1])
+    if (roll > np.pi + 0.01).any() or (pitch > np.pi / 2 + 0.01).any():
+        return "has a roll beyond ±π or a pitch beyond ±π/2: the unit is the radian"
+    yaw = angles[..., 2]
+    jumps = np.abs(np.diff(yaw, axis=0)) if yaw.ndim else np.zeros(0)
+    if (np.abs(yaw) < 361).all() and ((jumps > 340) & (jumps < 361)).any():
+        return "has a yaw that jumps by 360: the unit is the radian"
+    return None
 
 
 def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: str) -> Field:
@@ -244,13 +265,17 @@ class Layout:
         """The field `name` of x `[..., n]`."""
         return dict(zip((f.name for f in self.fields), self._split(x), strict=True))[name]
 
-    def unsound(self, x: np.ndarray) -> list[str]:
-        """Names of fields of which x `[..., n]` on the host holds what they cannot be."""
+    def flaws(self, x: np.ndarray) -> list[str]:
+        """What is wrong with x `[..., n]` on the host, a sentence a field: none if it is sound.
+
+        Where the first dimension is time, jumps from one row to the next are seen, too.
+        """
         parts = zip(self.fields, np.split(x, self._edges, axis=-1), strict=True)
-        return [f.name for f, part in parts if f.sound is not None and not f.sound(part)]
+        said = [(f.name, f.flaw(part) if f.flaw else None) for f, part in parts]
+        return [f"{name!r} {flaw}" for name, flaw in said if flaw]
 
     def canonical(self, x: Array) -> Array:
-        """x `[..., n]` with w ≥ 0 in its quaternions."""
+        """x `[..., n]` with w ≥ 0 in its quaternions and its Euler angles in [−π, π)."""
         if all(f.canonical is None for f in self.fields):
             return x
         parts = zip(self.fields, self._split(x), strict=True)
@@ -276,6 +301,10 @@ class Layout:
             if f.yaw is not None:
                 return f.yaw(part)
         raise ValueError("no field of this layout holds a heading")
+
+    def listed(self) -> list[list[str | int]]:
+        """Name, kind, size and unit of each field, as files keep them."""
+        return [[f.name, f.kind, f.size, f.unit] for f in self.fields]
 
     def describe(self) -> str:
         """A Markdown table of the fields."""

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from tiny import tiny
 
-from genidm import controller, symmetry
+from genidm import controller, files, symmetry
 from genidm.errors import BadInput
-from genidm.experience import Experience
+from genidm.experience import Experience, load
 from genidm.fit import fit
 from genidm.generalize import Generalize, generalize
 from genidm.methods import LR
+from genidm.pairs import Pairs
 from genidm.robots import Logged
 from genidm.symmetry import Layout
 
@@ -95,8 +96,8 @@ def test_nothing_can_be_stepped() -> None:
         (dict(last=log().last.astype(int)), "last is of int64, not bool"),
         (dict(first=log().first[:, 0]), r"first has shape \(60,\), not that of \[steps, lanes\]"),
         (dict(o=log().o[..., :2]), "o has shape"),
-        (dict(s=-log().s), "'orientation' in s is not of length 1 with w ≥ 0"),
-        (dict(s=2 * log().s), "'orientation' in s is not of length 1 with w ≥ 0"),
+        (dict(s=-log().s), "'orientation' is not of length 1 with w ≥ 0"),
+        (dict(s=2 * log().s), "'orientation' is not of length 1 with w ≥ 0"),
     ],
 )
 def test_logs_that_are_none_are_refused(changes: dict, why: str) -> None:
@@ -105,3 +106,195 @@ def test_logs_that_are_none_are_refused(changes: dict, why: str) -> None:
             Mine(), dataclasses.replace(log(), **changes), jax.random.key(0),
             Generalize(mode="rotate"), look_ahead=20,
         )  # fmt: skip
+
+
+# ── what logs are like (each was seen on somebody's) ────────────────────────────────────
+
+
+def ways(experience: Experience, look_ahead: int = 20) -> np.ndarray:
+    """d of the record and of its turned copy, `[2, N, 3]`."""
+    rotate = Generalize(mode="rotate")
+    pairs, _ = generalize(Mine(), experience, jax.random.key(0), rotate, look_ahead=look_ahead)
+    return np.asarray(pairs.d)
+
+
+def with_(name: str, where, value) -> np.ndarray:
+    """A copy of one of the log's arrays, changed in one place."""
+    array = getattr(log(), name).copy()
+    array[where] = value
+    return array
+
+
+def headings(d: np.ndarray) -> list[float]:
+    return np.unique(np.arctan2(d[0, :, 1], d[0, :, 0]).round(2)).tolist()
+
+
+def test_flags_that_contradict_each_other_are_refused() -> None:
+    for name, row in (("first", 30), ("last", 29)):
+        wrong = dataclasses.replace(log(), **{name: with_(name, (row, 1), True)})
+        with pytest.raises(BadInput, match=r"step \[30, 1\] begins .* \(first, last\)"):
+            ways(wrong)
+
+
+def test_a_jump_inside_an_episode_is_refused_and_between_two_is_not() -> None:
+    aside = np.zeros((60, 3, 3), np.float32)
+    aside[30:, 1, 0] = 3.0
+    moved = dataclasses.replace(log(), o=log().o + aside, o_next=log().o_next + aside)
+    with pytest.raises(BadInput, match=r"jumps by 3.* m to o \[30, 1\]"):
+        ways(moved)
+    with pytest.raises(BadInput, match=r"jumps by 3.* m to o_next \[29, 1\]"):
+        ways(dataclasses.replace(moved, o_next=np.concatenate([moved.o[1:], moved.o_next[-1:]])))
+    ended = dataclasses.replace(
+        moved, first=with_("first", (30, 1), True), last=with_("last", (29, 1), True)
+    )
+    assert headings(ways(ended)) == [-1, 0, 1]
+
+
+def test_a_step_that_is_not_valid_is_no_goal_either() -> None:
+    astray = dataclasses.replace(
+        log(), valid=with_("valid", 25, False), o_next=with_("o_next", 25, 50.0)
+    )
+    assert ways(astray).shape[1] == 3 * (60 - 19 - 2)
+    assert headings(ways(astray)) == [-1, 0, 1]
+
+
+def test_steps_that_are_not_valid_may_hold_anything() -> None:
+    """Gaps, and lanes of unequal length."""
+    gone = (slice(45, None), 2)
+    holes = {name: with_(name, gone, np.nan) for name in ("s", "o", "o_next", "a")}
+    short = dataclasses.replace(
+        log(), **holes, valid=with_("valid", gone, False), last=with_("last", (44, 2), True)
+    )
+    assert ways(short).shape[1] == 2 * (60 - 19) + (45 - 19)
+    with pytest.raises(BadInput, match=r"s holds NaN or infinity, first in \[45, 2\]"):
+        ways(dataclasses.replace(short, valid=log().valid, last=log().last))
+
+
+def test_positions_of_utm_size_are_turned_as_well_as_small_ones() -> None:
+    north = np.asarray([448_251.7, 5_411_932.3, 35.0])
+    near = dataclasses.replace(log(), o=np.float64(log().o), o_next=np.float64(log().o_next))
+    far = dataclasses.replace(near, o=near.o + north, o_next=near.o_next + north)
+    np.testing.assert_allclose(ways(far), ways(near), atol=1e-5)
+    rotate = Generalize(mode="rotate")
+    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, look_ahead=20)
+    assert residual["median"].max() < 1e-6
+
+
+def test_quaternions_in_the_order_of_ros_are_refused() -> None:
+    for heading in (log().s, np.abs(log().s)):
+        wrong = dataclasses.replace(log(), s=np.abs(heading[..., [1, 2, 3, 0, 4, 5, 6]]))
+        with pytest.raises(BadInput, match=r"the order is \(w, x, y, z\), not \(x, y, z, w\)"):
+            ways(wrong)
+
+
+class Euler(Mine):
+    name = "euler"
+    observation = Layout((symmetry.euler("orientation"), symmetry.vector("velocity", "m/s")))
+
+
+def angles(scale: float = 1.0, turns: float = 0.0) -> Experience:
+    yaw = np.tile(np.linspace(-1, 1, 3), (60, 1)) * scale + 2 * np.pi * turns
+    tilt = np.full_like(yaw, 0.03 * scale)
+    s = np.stack([tilt, tilt, yaw, *np.moveaxis(log().s[..., 4:], -1, 0)], -1)
+    return dataclasses.replace(log(), s=s.astype(np.float32))
+
+
+def samples(robot: Logged, experience: Experience) -> Pairs:
+    rotate = Generalize(mode="rotate")
+    return generalize(robot, experience, jax.random.key(0), rotate, look_ahead=20)[0]
+
+
+def test_an_angle_and_the_same_a_turn_on_are_one_state() -> None:
+    once, twice = (samples(Euler(), angles(turns=n)) for n in (0, 2))
+    np.testing.assert_allclose(once.s, twice.s, atol=1e-5)
+    model = fit(Euler(), once, jax.random.key(1), tiny(LR).fit, quiet=True)
+    way = np.asarray([[1.0, 0.0, 0.0]] * 3)
+    once, twice = (np.asarray(model(angles(turns=n).s[0], way)) for n in (0, 1))
+    np.testing.assert_allclose(once, twice, atol=1e-3)
+
+
+def test_degrees_are_refused() -> None:
+    with pytest.raises(BadInput, match="the unit is the radian"):
+        samples(Euler(), angles(scale=180 / np.pi))
+
+
+@pytest.mark.parametrize(
+    "as_logs_have_it",
+    [
+        lambda x: x.astype(">f4"),
+        lambda x: x.astype(object),
+        lambda x: x.tolist(),
+        lambda x: np.ma.masked_array(x, np.zeros_like(x, bool)),
+        lambda x: np.asfortranarray(x),
+    ],
+)
+def test_arrays_as_logs_have_them_are_converted(as_logs_have_it, tmp_path: Path) -> None:
+    names = ("s", "o", "o_next", "a")
+    odd = dataclasses.replace(log(), **{n: as_logs_have_it(getattr(log(), n)) for n in names})
+    np.testing.assert_allclose(ways(odd), ways(log()), atol=1e-6)
+    odd.save(tmp_path / "log")
+    np.testing.assert_allclose(ways(load(tmp_path / "log", Mine())), ways(log()), atol=1e-6)
+
+
+def test_what_no_number_stands_for_is_refused(tmp_path: Path) -> None:
+    masked = np.ma.masked_array(log().a, log().a > 0.9)
+    words = log().a.astype(object)
+    words[3, 1, 0] = "left"
+    for a, why in ((masked, "is masked"), (words, "something else than numbers")):
+        with pytest.raises(BadInput, match=why):
+            ways(dataclasses.replace(log(), a=a))
+    with pytest.raises(BadInput, match="a holds NaN"):
+        dataclasses.replace(log(), a=with_("a", (3, 1), np.nan)).save(tmp_path / "log")
+    log().save(tmp_path / "log")
+    with pytest.raises(BadInput, match="there already"):
+        log().save(tmp_path / "log")
+
+
+def test_a_controller_knows_the_layout_it_was_made_for(tmp_path: Path) -> None:
+    model = fit(Mine(), samples(Mine(), log()), jax.random.key(1), tiny(LR).fit, quiet=True)
+    model.save(tmp_path / "controller")
+    other, fields = Mine(), Mine.observation.fields
+    for observation in (Layout(fields[::-1]), Layout((*fields, symmetry.invariant("height")))):
+        other.observation = observation
+        with pytest.raises(BadInput, match=r"another observation of the mine: orientation .* here"):
+            controller.load(tmp_path / "controller", other)
+    more = Mine()
+    more.action = Layout((symmetry.joints("torque", [1, 0, 2], [1, 1, 1], "of full torque"),))
+    with pytest.raises(BadInput, match="another action"):
+        controller.load(tmp_path / "controller", more)
+
+
+def spoil(directory: Path, name: str, change) -> None:
+    """Changes a file of a controller, and makes its manifest say so."""
+    file = directory / name
+    np.save(file, change(np.load(file)))
+    manifest = files.load_json(directory / "manifest.json")
+    files.save_json(directory / "manifest.json", manifest | {name: files._measure(file)})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda x: x.T, r"is float32\[\d+, \d+\], where its architecture has"),
+        (lambda x: x * np.nan, "holds NaN or infinity"),
+        (lambda x: x.astype(np.float64), "is float64"),
+        (lambda x: x.astype("U3"), "is <U3"),
+    ],
+)
+def test_parameters_that_do_not_fit_the_architecture_are_refused(
+    tmp_path: Path, change, why: str
+) -> None:
+    model = fit(Mine(), samples(Mine(), log()), jax.random.key(1), tiny(LR).fit, quiet=True)
+    model.save(tmp_path / "controller")
+    (name,) = (p.name for p in (tmp_path / "controller").glob("params.lfm*Dense_0.kernel.npy"))
+    spoil(tmp_path / "controller", name, change)
+    with pytest.raises(BadInput, match=why):
+        controller.load(tmp_path / "controller", Mine())
+
+
+def test_a_controller_is_not_asked_with_what_is_not_finite() -> None:
+    model = fit(Mine(), samples(Mine(), log()), jax.random.key(1), tiny(LR).fit, quiet=True)
+    s, way = log().s[0], np.asarray([[1.0, 0.0, 0.0]] * 3)
+    for wrong in ((s * np.nan, way), (s, way * np.inf)):
+        with pytest.raises(BadInput, match="holds NaN or infinity"):
+            model(*wrong)

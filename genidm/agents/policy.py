@@ -36,6 +36,15 @@ def no_statistics(size: int) -> RunningStatisticsState:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
 
+def described(robot: Robot) -> dict[str, Any]:
+    """What a controller's directory says of its robot: the name, and what it sees and does."""
+    return {
+        "robot": robot.name,
+        "observation": robot.observation.listed(),
+        "action": robot.action.listed(),
+    }
+
+
 class Policy(flax.struct.PyTreeNode):
     """The mean action of a trained policy network, squashed by tanh.
 
@@ -66,12 +75,23 @@ class Policy(flax.struct.PyTreeNode):
         s = self.robot.heard(s, displacement)
         x = inputs(s, displacement if self.directed else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
-        outputs = self.params["params"][f"hidden_{len(self.hidden)}"]["bias"].shape[-1]
-        network = MLP((*self.hidden, outputs), ACTIVATIONS[self.activation])
-        out = network.apply(self.params, x)
+        out = self._network().apply(self.params, x)
         return jnp.tanh(out[..., : self.robot.action.size])
 
-    def save(self, path: Path, overwrite: bool = False) -> None:
+    def _network(self) -> MLP:
+        """Its outputs are the mean and, of agents that explore by a Gaussian, the deviation."""
+        outputs = self.params["params"][f"hidden_{len(self.hidden)}"]["bias"].shape[-1]
+        if outputs not in (self.robot.action.size, 2 * self.robot.action.size):
+            raise ValueError(f"its network has {outputs} outputs")
+        return MLP((*self.hidden, outputs), ACTIVATIONS[self.activation])
+
+    def fresh(self, key: jax.Array) -> dict[str, Any]:
+        """Parameters and statistics of the shapes that these have, untrained."""
+        size = self.robot.observation.size + 3 * self.directed
+        params = self._network().init(key, jnp.zeros(size))
+        return {"params": params, "mean": jnp.zeros(size), "std": jnp.ones(size)}
+
+    def save(self, path: Path | str, overwrite: bool = False) -> None:
         """Writes the policy as a directory, without pickle.
 
         Raises:
@@ -80,8 +100,7 @@ class Policy(flax.struct.PyTreeNode):
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
-        meta = {
-            "robot": self.robot.name,
+        meta = described(self.robot) | {
             "hidden": self.hidden,
             "activation": self.activation,
             "directed": self.directed,

@@ -107,12 +107,16 @@ class Robot(abc.ABC):
           displacement: `[..., 3]`, the way that it asks for.
 
         Raises:
-          BadInput: their shapes do not fit the robot, or each other.
+          BadInput: their shapes do not fit the robot, or each other; or, outside of jitted
+            programs, a number is not finite.
         """
         state, way = jnp.shape(s), jnp.shape(displacement)
         if state[-1:] != (self.observation.size,) or way != (*state[:-1], 3):
             wanted = f"s [..., {self.observation.size}] and a way [..., 3] in metres"
             raise BadInput(f"the {self.name} is told {wanted}, not {state} and {way}")
+        for x, name in ((s, "s"), (displacement, "the way")):
+            if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
+                raise BadInput(f"{name} holds NaN or infinity: nothing steers the {self.name} so")
         return self.observation.canonical(jnp.asarray(s))
 
     def at_once(self, lanes: int) -> int:

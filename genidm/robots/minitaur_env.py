@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from genidm.errors import BadInput
 from genidm.robots.minitaur import OBSERVATIONS, Observed
 from genidm.robots.minitaur_world import ACTIONS, Simulation, Solver, charge, has_fallen, parts
 
@@ -53,9 +54,14 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observe(parts(self.simulation.read())), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        before = self.simulation.read()[0]
-        self.simulation.step(np.asarray(action, np.float64))
+        action, last = np.asarray(action, np.float64), self.simulation.read()
+        if action.shape != (ACTIONS,) or not np.isfinite(action).all():
+            raise BadInput(f"an action is {ACTIONS} finite numbers, not {action}")
+        before = last[0]
+        self.simulation.step(action)
         row = self.simulation.read()
+        if not np.isfinite(row).all():  # nothing can be seen of it any more
+            return self._observe(parts(last)), 0.0, True, False, {"row": row}
         x = parts(row)
         reward = x["position"][0] - before - charge(x["torque"], x["rates"][:8])
         fallen = bool(has_fallen(x["orientation"], x["position"][2]))
