@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from genidm.cells import Cell
+from genidm.checks import check, count
 from genidm.errors import BadInput
 from genidm.experiment import (
     Options,
@@ -51,8 +52,7 @@ class Table(Options):
     spread_episodes: int = 200
 
     def __post_init__(self) -> None:
-        if self.seeds < 1 or self.spread_episodes < 1:
-            raise BadInput("a table needs seeds and spread_episodes of at least 1")
+        check(self, seeds=count(), spread_episodes=count())
 
 
 def chosen(options: Table) -> list[Direct | Inverse]:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from genidm import devices
 from genidm.agents.base import Agent, Learning
 from genidm.errors import BadInput
 from genidm.experience import Experience, concatenate, load
@@ -44,7 +45,8 @@ def collect(
         iteration of the agent.
       seed: of everything random in here.
       task: what is rewarded; walking forward, unless given.
-      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
+      mesh: devices to share the lanes among, evenly; of those that the robot's engine wants as
+        many as can, unless given.
       stage: where the record, checkpoints and metrics go; they stay in memory, unless given.
       keep: keep the record; off, the learner is all that is left.
       quiet: no progress bar.
@@ -52,7 +54,7 @@ def collect(
     Returns:
       the Experience `[T, lanes, ...]` (None unless kept), and the learner as it ended.
     """
-    mesh = mesh or robot.mesh()
+    mesh = mesh or devices.dividing(robot.mesh(), agent.lanes)
     _check(agent, interactions, mesh)
     learning = agent.learning(robot, task or WalkForward(), mesh)
     learner = learning.place(jax.jit(learning.start)(jax.random.key(seed)))

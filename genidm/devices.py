@@ -99,6 +99,12 @@ def mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
     )
 
 
+def dividing(mesh: Mesh, lanes: int) -> Mesh:
+    """As many devices of a mesh as share so many lanes evenly."""
+    count = next(n for n in range(mesh.size, 0, -1) if lanes % n == 0)
+    return mesh if count == mesh.size else Mesh(mesh.devices.flat[:count], mesh.axis_names)
+
+
 def accelerated() -> bool:
     """Whether jax runs on something else than a CPU."""
     return jax.default_backend() != "cpu"

@@ -18,7 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.errors import BadInput
+from genidm.checks import check, count, number
 from genidm.progress import compiled
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
@@ -56,8 +56,7 @@ class Test:
     chunk: int = 50
 
     def __post_init__(self) -> None:
-        if self.max_steps < 1 or self.lanes < 1 or self.chunk < 1 or self.reach < 0:
-            raise BadInput("a test needs max_steps, lanes, chunk ≥ 1 and reach ≥ 0")
+        check(self, max_steps=count(), lanes=count(), chunk=count(), reach=number(0))
 
 
 class Outcome(flax.struct.PyTreeNode):

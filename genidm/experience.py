@@ -18,6 +18,9 @@ from genidm.files import Torn
 from genidm.robots.base import Robot
 from genidm.tasks import Step
 
+# Metres; farther off, float32 rounds a position by more than 0.01 mm.
+FAR = 100.0
+
 
 class Experience(flax.struct.PyTreeNode):
     """Recorded transitions, T steps of B lanes, in the order they happened.
@@ -65,6 +68,9 @@ class Experience(flax.struct.PyTreeNode):
             steps holds what is not finite.
         """
         made = jax.tree.map(_plain, _named(self))
+        lanes = made.first.shape
+        if any(x.shape[:2] != lanes for x in jax.tree.leaves(made)):
+            raise BadInput(f"experience: not all arrays are of {lanes} steps and lanes")
         _finite(_cleared(made))
         tree = flax.serialization.to_state_dict(made)
         there = {name: x for name, x in tree.items() if x is not None}
@@ -79,9 +85,9 @@ class Experience(flax.struct.PyTreeNode):
     def prepared(self, robot: Robot) -> Experience:
         """The record as 𝒢 and a fit can use it: NumPy arrays, and s as controllers are fed it.
 
-        Steps that are not `valid` are not looked at: what they hold is set to zero. Without
-        physics to be replayed from, positions count from the start of each episode; they are
-        subtracted in the precision that they come in, so that float64 of UTM size is no harm.
+        Steps that are not `valid` are not looked at: what they hold is set to zero. Positions
+        that float32 would round (UTM), without physics to be replayed from, count from the start
+        of each episode; that is subtracted in the precision that they come in.
 
         Raises:
           BadInput: the shapes do not fit together or the robot, or what a valid step holds cannot
@@ -94,10 +100,15 @@ class Experience(flax.struct.PyTreeNode):
         _finite(clean)
         _possible(clean, robot)
         _continuous(clean, robot)
-        if clean.physics is None:
+        if clean.far_away:
             clean = clean.centred()
         narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
         return narrow.replace(s=np.asarray(robot.observation.canonical(jnp.asarray(narrow.s))))
+
+    @property
+    def far_away(self) -> bool:
+        """Whether positions are to be counted from the start of each episode."""
+        return self.physics is None and bool(np.abs(np.asarray(self.o)[self.valid]).max() > FAR)
 
     def centred(self) -> Experience:
         """Positions that count from the start of each episode, horizontally."""
@@ -250,20 +261,20 @@ def load(path: Path | str, robot: Robot) -> Experience:
     return experience.replace(physics=physics)
 
 
-def load_chunks(directory: Path, robot: Robot, interactions: int) -> Experience:
+def load_chunks(directory: Path, robot: Robot, interactions: int | None = None) -> Experience:
     """The record that `collect` wrote in chunks.
 
     Args:
       directory: where they lie.
       robot: whose record it is.
-      interactions: how many there must be.
+      interactions: how many there must be; as many as there are, unless given.
 
     Raises:
       BadInput: a chunk is torn, or missing.
     """
     chunks = [load(path, robot) for path in sorted(directory.glob("chunk_*"))]
     found = sum(chunk.interactions for chunk in chunks)
-    if found != interactions:
+    if interactions is not None and found != interactions:
         raise Torn(
             f"{directory} holds {found} of {interactions} interactions: a chunk is missing. "
             f"Delete {directory.parent} to collect it anew"

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from genidm import devices
+from genidm.checks import check, count, layers, number, optional, positive
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
 from genidm.models import Architecture
@@ -54,12 +55,12 @@ class Fit:
     averaged: bool = True
 
     def __post_init__(self) -> None:
-        if not 0 < self.latent_weight < 1:
-            raise BadInput(f"λ (latent_weight) must lie in (0, 1), not at {self.latent_weight}")
-        if self.latent_size is not None and self.latent_size < 1:
-            raise BadInput(f"k (latent_size) must be at least 1, not {self.latent_size}")
-        if self.updates < 1 or self.batch < 1:
-            raise BadInput("updates and batch must be at least 1")
+        check(
+            self, {"latent_weight": "λ (latent_weight)", "latent_size": "k (latent_size)"},
+            updates=count(), batch=count(), learning_rate=positive(), idm=layers, lfm=layers,
+            latent_size=optional(count(1, 1 << 16)),
+            latent_weight=number(0, 1, above=True, below=True),
+        )  # fmt: skip
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam, with the schedule."""

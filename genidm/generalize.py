@@ -18,6 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import symmetry
+from genidm.checks import check, count, optional
 from genidm.engines import Engine
 from genidm.errors import BadInput
 from genidm.experience import Experience
@@ -48,9 +49,7 @@ class Generalize:
     lanes: int = 512
 
     def __post_init__(self) -> None:
-        segment = 1 if self.segment is None else self.segment
-        if min(segment, self.copies, self.lanes) < 1:
-            raise BadInput("𝒢 needs segment, copies and lanes of at least 1")
+        check(self, segment=optional(count()), copies=count(), lanes=count())
 
     def on(self, robot: Robot) -> Generalize:
         """The settings with a segment's length chosen for the robot, unless it is given."""
@@ -130,7 +129,7 @@ def residual(experience: Experience, turned: Replay, steps: int = 200) -> dict[s
       "step" `[n]`, and "median", "p90" `[n]`: metres between o_next replayed and the
       record's own turned, over all samples that many steps after a placing.
     """
-    record = experience if experience.physics is not None else experience.centred()
+    record = experience.centred() if experience.far_away else experience
     o_next = jnp.asarray(record.o_next, jnp.float32)
     exact = jax.vmap(symmetry.turn_vector, (None, 0))(o_next, turned.yaw)
     distance = np.linalg.norm(np.asarray(exact) - turned.o_next, axis=-1)

@@ -14,6 +14,7 @@ from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
+from genidm.checks import check, count, positive
 from genidm.controller import Frame
 from genidm.errors import BadInput
 from genidm.fit import Fit
@@ -36,8 +37,9 @@ class Method:
     task: WalkForward | GoToGoal
 
     def __post_init__(self) -> None:
-        if not self.name.strip() or "/" in self.name or self.name.startswith("."):
-            raise BadInput(f"a method's name begins directories: not {self.name!r}")
+        name = self.name
+        if not name.strip() or "/" in name or name.startswith(".") or not name.isprintable():
+            raise BadInput(f"a method's name begins directories: not {name!r:.60}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,10 +74,7 @@ class Inverse(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.share <= 1:
-            raise BadInput(f"share must lie in (0, 1], not at {self.share}")
-        if self.look_ahead < 1:
-            raise BadInput(f"look_ahead must be at least 1, not {self.look_ahead}")
+        check(self, share=positive(1), look_ahead=count())
 
 
 RL = Inverse(

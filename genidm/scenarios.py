@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from genidm.checks import count
 from genidm.errors import BadInput
 from genidm.robots.base import Robot
 from genidm.tasks import ahead
@@ -59,8 +60,9 @@ def scenarios(
       episodes: episodes a seed.
       first_seed: the first of them.
     """
-    if seeds < 1 or episodes < 1:
-        raise BadInput("a test needs at least one seed and one episode")
+    for name, number in (("seeds", seeds), ("episodes", episodes)):
+        if count()(number):
+            raise BadInput(f"{name} of a test {count()(number)}, not {number!r}")
     numbers = jnp.arange(first_seed, first_seed + seeds)
     return _bank(robot, numbers, jnp.arange(episodes))
 

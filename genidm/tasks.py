@@ -14,7 +14,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from genidm.errors import BadInput
+from genidm.checks import check, count, number, positive
 from genidm.robots.base import Robot, State
 from genidm.symmetry import horizontal
 
@@ -120,7 +120,7 @@ class WalkForward:
     directed: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        _check_length(self.episode_steps)
+        check(self, episode_steps=count(), start_yaw=number(0))
 
     def start(self, robot: Robot, keys: jax.Array) -> Lanes:
         robots, streams = _fresh(robot, keys, self.start_yaw)
@@ -192,6 +192,9 @@ class Dense:
     distance: float = 1.0
     cost: float = 0.1
 
+    def __post_init__(self) -> None:
+        check(self, distance=number(0), cost=number(0))
+
     def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
         far = jnp.where(step.reached, 0.0, -self.distance * step.after)
         return far - self.cost * step.cost, far
@@ -219,9 +222,8 @@ class GoToGoal:
     directed: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        _check_length(self.episode_steps)
-        if self.reach <= 0:
-            raise BadInput(f"reach must be above 0, not {self.reach}")
+        angle = number(0)
+        check(self, episode_steps=count(), start_yaw=angle, bearing=angle, reach=positive())
 
     def start(self, robot: Robot, keys: jax.Array) -> Lanes:
         robots, streams = _fresh(robot, keys, self.start_yaw)
@@ -284,11 +286,6 @@ def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -
     offset = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1) * distance[:, None]
     height = jnp.full_like(distance, robot.standing_height)
     return jnp.concatenate([state.position[:, :2] + offset, height[:, None]], axis=-1)
-
-
-def _check_length(episode_steps: int) -> None:
-    if episode_steps < 1:
-        raise BadInput(f"episodes need at least 1 step, not {episode_steps}")
 
 
 def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.Array]:

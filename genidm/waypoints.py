@@ -14,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import devices
+from genidm.checks import check, count, positive
 from genidm.errors import BadInput
 from genidm.evaluate import Steering
 from genidm.progress import Progress, compiled
@@ -56,8 +57,7 @@ class Follow:
     chunk: int = 50
 
     def __post_init__(self) -> None:
-        if self.max_steps < 1 or self.chunk < 1 or self.reach <= 0:
-            raise BadInput("a journey needs max_steps and chunk ≥ 1, and a reach above 0")
+        check(self, max_steps=count(), chunk=count(), reach=positive())
 
 
 @dataclasses.dataclass(frozen=True)

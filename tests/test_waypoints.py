@@ -121,7 +121,7 @@ def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
             journey(Point(), waypoints=wrong)
     with pytest.raises(BadInput, match="each of as many"):
         journey(Point(), waypoints=[[1.0, 2.0], [3.0]])
-    with pytest.raises(BadInput, match="reach above 0"):
+    with pytest.raises(BadInput, match=r"reach must lie in \(0, ∞\)"):
         Follow(reach=0.0)
 
 

@@ -14,7 +14,7 @@ from genidm.agents.off_policy import OffPolicy
 from genidm.agents.policy import Policy, no_statistics
 from genidm.agents.ppo import PPO
 from genidm.agents.sac import SAC
-from genidm.errors import BadInput
+from genidm.checks import check, number
 from genidm.experience import Experience
 from genidm.progress import compiled
 from genidm.robots.base import Robot
@@ -37,8 +37,7 @@ class Frozen:
     share: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.share < 1:
-            raise BadInput(f"a frozen agent learns for a share in (0, 1), not {self.share}")
+        check(self, share=number(0, 1, above=True, below=True))
 
     def wide(self) -> Frozen:
         """The same with a wide agent, where it can be (`OffPolicy.wide`)."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from genidm.agents.buffer import Buffer, Index
-from genidm.errors import BadInput
+from genidm.checks import check, count
 
 Strategy = Literal["future", "final", "episode"]
 
@@ -29,8 +29,7 @@ class HER:
     goals: int = 4
 
     def __post_init__(self) -> None:
-        if self.goals < 1:
-            raise BadInput(f"HER needs at least 1 goal a step, not {self.goals}")
+        check(self, goals=count())
 
     def goal(
         self, buffer: Buffer, left: jax.Array, at: Index, key: jax.Array, height: float

@@ -37,6 +37,7 @@ from genidm.agents.buffer import (
 from genidm.agents.her import HER
 from genidm.agents.policy import Policy, no_statistics
 from genidm.agents.walking import walk
+from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
@@ -104,10 +105,12 @@ class OffPolicy(abc.ABC):
     her: HER | None = None
 
     def __post_init__(self) -> None:
-        if min(self.lanes, self.unroll, self.updates, self.batch) < 1:
-            raise BadInput("lanes, unroll, updates and batch must be at least 1")
-        if not 0 < self.discount < 1:
-            raise BadInput(f"discount must lie in (0, 1), not at {self.discount}")
+        check(
+            self, lanes=count(), unroll=count(), updates=count(), batch=count(),
+            capacity=count(), warmup=count(0), learning_rate=positive(),
+            discount=number(0, 1, above=True, below=True), tau=positive(1),
+            reward_scale=positive(), hidden=layers, critic_hidden=layers,
+        )  # fmt: skip
         size = self.lanes * self.unroll
         if self.warmup > self.capacity // size * size:
             room = f"a buffer for {self.capacity} steps"

@@ -31,6 +31,7 @@ from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Learning, Metrics
 from genidm.agents.policy import Policy, no_statistics, normalize
 from genidm.agents.walking import walk
+from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
@@ -84,8 +85,12 @@ class PPO:
     max_gradient: float = 1.0
 
     def __post_init__(self) -> None:
-        if min(self.lanes, self.unroll, self.epochs, self.minibatches) < 1:
-            raise BadInput("PPO needs lanes, unroll, epochs and minibatches of at least 1")
+        check(
+            self, lanes=count(), unroll=count(), epochs=count(), minibatches=count(),
+            learning_rate=positive(), discount=number(0, 1, above=True, below=True),
+            gae=number(0, 1), clip=positive(), entropy=number(0), reward_scale=positive(),
+            hidden=layers, value_hidden=layers, max_gradient=positive(),
+        )  # fmt: skip
         if self.lanes % self.minibatches:
             uneven = f"{self.lanes} lanes cannot be shared among {self.minibatches} minibatches"
             raise BadInput(f"{uneven} evenly")

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
 from genidm.agents.walking import walk
-from genidm.errors import BadInput
+from genidm.checks import check, count
 from genidm.experience import Experience
 from genidm.progress import compiled
 from genidm.robots.base import Robot
@@ -38,8 +38,7 @@ class RandomActions:
     unroll: int = 32
 
     def __post_init__(self) -> None:
-        if self.lanes < 1 or self.unroll < 1:
-            raise BadInput("random sampling needs lanes and unroll of at least 1")
+        check(self, lanes=count(), unroll=count())
 
     def policy(self, robot: Robot, task: Task, learner: Learner) -> None:
         """There is none: nothing is learned."""

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from genidm.errors import BadInput
+from genidm.checks import check, count, number, positive
 from genidm.progress import Progress
 from genidm.video import backends
 from genidm.video.filming import Film, Take
@@ -49,8 +49,8 @@ class Shot:
     caption: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.width, self.height) < 16 or self.fps <= 0 or self.hold < 0:
-            raise BadInput("a shot needs width, height ≥ 16, fps above 0 and hold ≥ 0")
+        size = count(16, 8192)
+        check(self, width=size, height=size, fps=positive(1000), hold=number(0, 3600))
 
 
 def frames(film: Film, shot: Shot, quiet: bool = False) -> Iterator[np.ndarray]:
