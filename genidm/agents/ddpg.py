@@ -17,6 +17,7 @@ from brax.training.types import Transition
 from genidm.agents.base import Metrics
 from genidm.agents.off_policy import Algorithm, OffPolicy
 from genidm.agents.policy import normalize
+from genidm.checks import check, number
 from genidm.robots.base import Robot
 
 
@@ -45,6 +46,10 @@ class DDPG(OffPolicy):
     noise: float = 0.1
     random: float = 0.1
     action_cost: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, noise=number(0), random=number(0, 1), action_cost=number(0))
 
     def networks(self, robot: Robot, size: int) -> tuple[FeedForwardNetwork, FeedForwardNetwork]:
         """Brax's policy (before tanh) and critic, on normalised inputs."""
