@@ -146,7 +146,7 @@ def metres(value: float | None) -> str:
 def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> None:
     """Fits, tests, and prints the numbers."""
     robot = by_name(options.robot, options.engine)
-    print((run(robot, LR, options) / "table.txt").read_text())
+    print((run(robot, LR, options) / "table.txt").read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

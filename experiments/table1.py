@@ -148,7 +148,7 @@ def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
     robot = robot_by_name(options.robot, options.engine)
     report, failures = run(robot, chosen(options), options)
     if report:
-        print((report / "table.txt").read_text())
+        print((report / "table.txt").read_text(encoding="utf-8"))
     if failures:
         print(f"error: {len(failures)} cells did not end; see above", file=sys.stderr)
         sys.exit(2 if all(isinstance(error, BadInput) for error in failures) else 1)

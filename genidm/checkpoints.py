@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 import sys
@@ -16,8 +17,27 @@ import numpy as np
 from genidm import files
 from genidm.errors import BadInput
 
-# Seconds between checkpoints of a long stage; tests that kill runs ask for fewer.
-CHECKPOINT_SECONDS = float(os.environ.get("GENIDM_CHECKPOINT_SECONDS", "60"))
+
+def requested_seconds() -> float:
+    """Seconds between checkpoints of a long stage: `GENIDM_CHECKPOINT_SECONDS`, or 60.
+
+    Raises:
+      BadInput: it is no number of seconds. Commands say so before they begin.
+    """
+    text = os.environ.get("GENIDM_CHECKPOINT_SECONDS", "").strip() or "60"
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not seconds >= 0:
+        raise BadInput(f"GENIDM_CHECKPOINT_SECONDS is a number of seconds, not {text!r:.40}")
+    return seconds
+
+
+try:
+    CHECKPOINT_SECONDS = requested_seconds()
+except BadInput:
+    CHECKPOINT_SECONDS = 60.0
 
 
 class Checkpoints:

@@ -17,6 +17,8 @@ from typing import Any
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from genidm.errors import BadInput
+
 LANES = "lanes"
 # Robots that keep an accelerator busy; MJX steps hardly more a second with more of them.
 BUSY = 4096
@@ -25,7 +27,9 @@ ROBOT = 1 << 17
 
 
 def configure() -> None:
-    """Sets jax up for this package; called on import, before a backend starts.
+    """Sets jax up for this package, before a backend starts: called on import of this module.
+
+    Everything that computes imports it, from wherever Python has found the package.
 
     - one CPU device, until MJX asks for more, or as many as `GENIDM_DEVICES` says (a number
       that the user has already given to jax stands);
@@ -34,20 +38,46 @@ def configure() -> None:
     - the persistent compilation cache on, in `~/.cache/genidm/xla`
       (`JAX_COMPILATION_CACHE_DIR` overrides).
     """
-    if "GENIDM_DEVICES" in os.environ:
-        with contextlib.suppress(RuntimeError):  # the caller has used jax: their devices stand
-            _make(int(os.environ["GENIDM_DEVICES"]))
+    with contextlib.suppress(RuntimeError, BadInput):  # the caller has used jax: theirs stand
+        if count := requested():
+            _make(count)
     # A program that calls the host can wait for itself, for ever, if it runs in the background
     # (jax issue 25861); MJX on several devices steps as fast without that.
     if "JAX_CPU_ENABLE_ASYNC_DISPATCH" not in os.environ:
         jax.config.update("jax_cpu_enable_async_dispatch", False)
     if _setting("jax_default_matmul_precision") is None:
         jax.config.update("jax_default_matmul_precision", "highest")
-    if _setting("jax_compilation_cache_dir") is None:
-        cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "genidm" / "xla"
+    if _setting("jax_compilation_cache_dir") is None and (cache := _cache()):
         jax.config.update("jax_compilation_cache_dir", str(cache))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def requested() -> int | None:
+    """How many CPU devices `GENIDM_DEVICES` asks for; None if it does not.
+
+    Raises:
+      BadInput: it is no number of devices. Commands say so before they begin; an import goes on
+        without it.
+    """
+    text = os.environ.get("GENIDM_DEVICES", "").strip()
+    if not text:
+        return None
+    if not (text.isascii() and text.isdecimal() and 1 <= int(text) <= 4096):
+        raise BadInput(f"GENIDM_DEVICES is a number of devices from 1 to 4096, not {text!r:.40}")
+    return int(text)
+
+
+def _cache() -> Path | None:
+    """Where compiled programs are kept; None, with a warning, where there is no home."""
+    there = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        # The specification of XDG_CACHE_HOME: what is no absolute path counts as not set.
+        base = there if there.is_absolute() else Path("~/.cache").expanduser()
+    except RuntimeError:
+        print("warning: no home directory: compiled programs are not kept", file=sys.stderr)
+        return None
+    return base / "genidm" / "xla"
 
 
 def spread() -> None:
@@ -162,3 +192,6 @@ def over_lanes(
     return jax.shard_map(
         f, mesh=mesh, in_specs=tuple(spec(i) for i in inputs), out_specs=out, check_vma=False
     )
+
+
+configure()

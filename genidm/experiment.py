@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -16,6 +18,7 @@ from genidm.agents.frozen import Frozen
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
+from genidm.checkpoints import requested_seconds
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test
 from genidm.methods import Direct, Inverse, literal
@@ -198,7 +201,11 @@ def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
         method: Direct | Inverse = method,
     ) -> None:
         with_engine = {} if options.engine is None else {"engine": options.engine}
-        print((run_cell(robot(**with_engine), method, options) / "table.txt").read_text())
+        print(
+            (run_cell(robot(**with_engine), method, options) / "table.txt").read_text(
+                encoding="utf-8"
+            )
+        )
 
     guarded(command, f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end.")
 
@@ -209,10 +216,23 @@ def guarded(command: Callable[..., None], description: str) -> None:
     The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
     """
     warnings.showwarning = _warn
+    # Files are written, no window is opened: not even where Jupyter's backend is inherited.
+    os.environ["MPLBACKEND"] = "Agg"
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # "≤" on a terminal that has none
     try:
+        devices.requested()
+        requested_seconds()
         tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,))
     except BadInput as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except MemoryError as error:
+        print(f"error: not enough memory: {error}", file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:  # what reads the output has ended: `… | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)
     except KeyboardInterrupt:
         print("stopped: the same command goes on where it was", file=sys.stderr)

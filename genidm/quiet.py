@@ -7,15 +7,20 @@ may have to say is kept, on stderr.
 import contextlib
 import io
 import sys
+from types import ModuleType
 
 
-def import_mjx() -> None:
+def _import_mjx() -> ModuleType:
     """Imports `mujoco.mjx`; the first import in a process is the one that prints."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said):
-            import mujoco.mjx  # noqa: F401
+            from mujoco import mjx
+        return mjx
     finally:
         for line in said.getvalue().splitlines():
             if not line.endswith("No module named 'warp'"):
                 print(line, file=sys.stderr)
+
+
+mjx = _import_mjx()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
+import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,9 @@ from typing import Any
 from genidm.checkpoints import Checkpoints
 from genidm.config import digest, environment
 from genidm.files import Torn, disk, load_json, remove, save_json
+
+# Windows has no such locks: there nobody waits for another process.
+fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +98,9 @@ class Stage:
 @contextlib.contextmanager
 def _alone(directory: Path) -> Iterator[None]:
     """Holds the lock of a directory; goes without where the file system has none."""
+    if fcntl is None:
+        yield
+        return
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):

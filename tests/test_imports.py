@@ -15,8 +15,8 @@ PACKAGE = Path(genidm.__file__).parent
 
 # Modules on one line know nothing of each other.
 ORDER = """
-errors episodes devices quiet
-checks
+errors episodes quiet
+checks devices
 symmetry
 genidm
 config

@@ -204,7 +204,7 @@ def gpu(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the child is stopped, too
     call = Call(options)
     got = call.run()
-    print(call.results.path.with_suffix(".md").read_text())
+    print(call.results.path.with_suffix(".md").read_text(encoding="utf-8"))
     print(f"{got}. The same command goes on from here.")
     if call.failed:
         print(f"error: failed: {'; '.join(call.failed)}", file=sys.stderr)

@@ -39,7 +39,7 @@ def trial(robot: Robot) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="genidm-") as out, compiling() as counted:
         scale = str(INTERACTIONS / robot.paper_interactions)
         options = Options(scale=scale, out=Path(out), episodes=EPISODES, test=TEST)
-        print((run_cell(robot, method, options) / "table.txt").read_text())
+        print((run_cell(robot, method, options) / "table.txt").read_text(encoding="utf-8"))
     return {"seconds": round(counted["wall"], 1), "compiling": round(counted["seconds"], 1)}
 
 

@@ -126,7 +126,7 @@ def report(job: Job) -> None:
     assert job.method
     this = cell(robot, by_name(job.method, robot.name), job.options)
     place = write_report(this, bank_of(this, job.options), job.options)
-    print((place / "table.txt").read_text())
+    print((place / "table.txt").read_text(encoding="utf-8"))
     names = dict(robot=job.robot, engine=job.stepper, scale=job.scale)
     job.results.put("reports", names | {"place": str(place)})
 

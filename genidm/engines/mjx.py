@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from genidm import devices
 from genidm.engines.base import Engine, Physics, Stepped
+from genidm.quiet import mjx
 
 
 class MJX(Engine):
