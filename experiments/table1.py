@@ -52,6 +52,7 @@ class Table(Options):
     spread_episodes: int = 200
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check(self, seeds=count(), spread_episodes=count())
 
 

@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Agent, Learning
+from genidm.checks import count
 from genidm.errors import BadInput
 from genidm.experience import Experience, concatenate, load
 from genidm.progress import Progress
@@ -83,8 +84,9 @@ def whole(agent: Agent, interactions: int) -> int:
 
 
 def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
-    if interactions < 1:
-        raise BadInput(f"interactions must be at least 1, not {interactions}")
+    why = count()(interactions)
+    if why:
+        raise BadInput(f"interactions {why}, not {interactions}")
     if agent.lanes % mesh.size:
         raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
 

@@ -19,6 +19,7 @@ from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.checkpoints import requested_seconds
+from genidm.checks import check, count, optional
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test
 from genidm.methods import Direct, Inverse, literal
@@ -56,6 +57,10 @@ class Options:
     results: Path | None = None
     video: bool = False
     test: Test = dataclasses.field(default_factory=Test)
+
+    def __post_init__(self) -> None:
+        # A seed has 32 bits: jax would take 2³² for 0.
+        check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
 
 
 def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:

@@ -67,7 +67,7 @@ def scale_of(text: str, interactions: int) -> Scale:
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
     interactions = max(1, round(interactions * share))
     return Scale(
-        name=text,
+        name=f"{share:g}",  # by its value: 5e-4 is 0.0005
         interactions=interactions,
         updates=min(share, 1.0),
         seeds=10,

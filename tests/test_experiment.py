@@ -197,6 +197,17 @@ def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Pa
     assert {"point_table.txt", "point_violins.png", "point_paths.png"} <= written.keys()
 
 
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"scale": "0.5", "test": {}}', "\x00"])
+def test_what_is_no_summary_spoils_no_report(copy: Path, capsys, content: str) -> None:
+    was = (copy / "point" / "report-0.5" / "table.txt").read_text()
+    foreign = copy / "point" / "test-theirs" / "done.json"
+    foreign.parent.mkdir()
+    foreign.write_text(content)
+    command(copy)
+    said = capsys.readouterr()
+    assert said.out == was + "\n" and f"{foreign} is no summary of a test" in said.err
+
+
 @pytest.mark.parametrize(
     ("changes", "again"),
     [
@@ -264,6 +275,18 @@ def test_scales_are_shares_of_the_paper() -> None:
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
         with pytest.raises(BadInput, match="--scale"):
             scale_of(wrong, 2000)
+
+
+@pytest.mark.parametrize("text", ["5e-4", "0.00050", "+.0005"])
+def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
+    assert scale_of(text, 2_000_000) == scale_of("0.0005", 2_000_000)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 10**30, 1.5])
+def test_seeds_have_32_bits(seed: float) -> None:
+    with pytest.raises(BadInput, match="seed must be"):
+        Options(seed=seed)
+    assert Options(seed=2**32 - 1).seed == 2**32 - 1
 
 
 # ── a method that learns to go to goals itself ──────────────────────────────────────────

@@ -14,6 +14,7 @@ import numpy as np
 from genidm import files
 from genidm.config import plain
 from genidm.episodes import Episodes
+from genidm.errors import BadInput
 from genidm.evaluate import Test
 from genidm.methods import ORDER
 from genidm.report.rows import Row
@@ -123,10 +124,16 @@ def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) 
 def _finished(robot: Robot, root: Path, scale: str, settings: Test) -> Iterator[Tested]:
     """All finished tests at a scale, on the robot's engine, oldest first."""
     done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
+    asked = (scale, plain(settings), robot.engine_name)
     for path in done:
-        summary = files.load_json(path)
-        asked = (scale, plain(settings), robot.engine_name)
-        if (summary["scale"], summary["test"], summary.get("engine")) == asked:
+        try:
+            summary = files.load_json(path)
+            found = (summary["scale"], summary["test"], summary["engine"])
+        except (BadInput, KeyError, TypeError):
+            # Of an older version, or of something else: no reason to have no report at all.
+            print(f"warning: {path} is no summary of a test, and is left out", file=sys.stderr)
+            continue
+        if found == asked:
             yield Tested(path.parent, summary)
 
 
