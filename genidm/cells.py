@@ -29,7 +29,7 @@ from genidm.episodes import Episodes
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test, episodes, flatten, run
 from genidm.experience import Experience
-from genidm.fit import Fit, fit
+from genidm.fit import fit
 from genidm.generalize import replay, residual
 from genidm.methods import Direct, Inverse, Method
 from genidm.pairs import pairs
@@ -241,7 +241,7 @@ class InverseCell(Cell[Inverse]):
         source = self.replay_stage or self.experience_stage
         config = dict(
             source=source.directory.name, share=m.share, look_ahead=m.look_ahead,
-            mirror=m.mirror, frame=m.frame, fit=self._fit,
+            mirror=m.mirror, frame=m.frame, fit=m.fit,
         )  # fmt: skip
         again = {"repeat": self.repeat} if self.repeat else {}
         return Stage.open(self.root, self._label, config | again)
@@ -250,13 +250,6 @@ class InverseCell(Cell[Inverse]):
     def _fit_key(self) -> jax.Array:
         key = self._key(2)
         return jax.random.fold_in(key, self.repeat) if self.repeat else key
-
-    @functools.cached_property
-    def _fit(self) -> Fit:
-        settings = self.method.fit
-        return dataclasses.replace(
-            settings, updates=max(1, round(settings.updates * self.scale.updates))
-        )
 
     def controller(self) -> Steering:
         """The fitted models."""
@@ -270,7 +263,7 @@ class InverseCell(Cell[Inverse]):
         samples = pairs(
             self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
         )
-        model = fit(self.robot, samples, self._fit_key, self._fit, frame=m.frame, stage=stage)
+        model = fit(self.robot, samples, self._fit_key, m.fit, frame=m.frame, stage=stage)
         model.save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,
@@ -279,7 +272,7 @@ class InverseCell(Cell[Inverse]):
             "interactions": self._count(self.experience_stage, "interactions"),
             "learned_from": record.interactions,
             "replayed": self._count(self.replay_stage, "replayed"),
-            "settings": plain(dataclasses.replace(m, fit=self._fit)),
+            "settings": plain(m),
         }
 
     def _count(self, stage: Stage | None, what: str) -> int:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +21,7 @@ from genidm.agents.ppo import PPO
 from genidm.cells import Cell, DirectCell, InverseCell
 from genidm.checkpoints import requested_seconds
 from genidm.checks import check, count, optional
+from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.evaluate import Steering, Test
 from genidm.methods import Direct, Inverse, literal
@@ -63,10 +65,15 @@ class Options:
         check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
 
 
-def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
-    """The cell that a method and a user's options name."""
-    if options.video:
-        robot.drawing()  # what cannot be filmed is said before anything is computed
+def resolve(robot: Robot, method: Direct | Inverse, options: Options) -> Direct | Inverse:
+    """A method as the scale, the machine and the robot's engine have it.
+
+    On the command line this is what the flags of a method start from, so that what the user
+    sets stands, also where it equals a default.
+
+    Raises:
+      BadInput: the scale is none, or the paper has no other settings for the method.
+    """
     scale = scale_of(options.scale, robot.paper_interactions)
     if isinstance(method.agent, PPO) and method.agent == PPO(hidden=method.agent.hidden):
         agent = dataclasses.replace(scale.ppo, hidden=method.agent.hidden)
@@ -74,18 +81,14 @@ def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
     if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
         wide: Any = method.agent.wide()  # of the method's own type
         method = dataclasses.replace(method, agent=wide)
-    given: dict[str, Any] = dict(
-        robot=robot, scale=scale, seed=options.seed, root=options.out / robot.name,
-        test=options.test,
-    )  # fmt: skip
     if isinstance(method, Direct):
         if options.literal:
             raise BadInput(f"{method.name} has no settings that the paper's letter would change")
-        return DirectCell(method=method, **given)
+        return method
     method = _fitting(literal(method) if options.literal else method, scale)
     if method.generalize:
         method = dataclasses.replace(method, generalize=method.generalize.on(robot))
-    return InverseCell(method=method, **given)
+    return method
 
 
 def _fitting(method: Inverse, scale: Scale) -> Inverse:
@@ -93,22 +96,45 @@ def _fitting(method: Inverse, scale: Scale) -> Inverse:
     agent = method.agent
     if isinstance(agent, Frozen):
         agent = dataclasses.replace(agent, share=max(agent.share, scale.learning))
+    updates = max(1, round(method.fit.updates * scale.updates))
     return dataclasses.replace(
         method,
         agent=agent,
         look_ahead=min(method.look_ahead, scale.look_ahead),
         share=max(method.share, scale.share),
+        fit=dataclasses.replace(method.fit, updates=updates),
     )
 
 
+def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
+    """The cell of a method as scale and machine have it (`resolve`)."""
+    return cell_of(robot, resolve(robot, method, options), options)
+
+
+def cell_of(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
+    """The cell of a method exactly as it is given."""
+    if options.video:
+        robot.drawing()  # what cannot be filmed is said before anything is computed
+    given: dict[str, Any] = dict(
+        robot=robot, scale=scale_of(options.scale, robot.paper_interactions), seed=options.seed,
+        root=options.out / robot.name, test=options.test,
+    )  # fmt: skip
+    kind: Any = DirectCell if isinstance(method, Direct) else InverseCell
+    return kind(method=method, **given)
+
+
 def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
-    """Runs a cell to its end and writes the report of all cells beside it.
+    """Runs the cell of a method, as scale and machine have it, and writes the report.
 
     Returns:
-      the directory of the report.
+      the directory of the report of all cells beside it.
     """
-    this = cell(robot, method, options)
-    announce(robot, options.engine)
+    return run_to_the_end(cell(robot, method, options), options)
+
+
+def run_to_the_end(this: Cell[Any], options: Options) -> Path:
+    """Runs a cell and writes the report of all cells beside it: its directory is returned."""
+    announce(this.robot, options.engine)
     tested = bank_of(this, options)
     this.episodes(tested)
     if options.video:
@@ -199,24 +225,92 @@ def announce(robot: Robot, engine: str | None) -> None:
 
 
 def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
-    """The command line of a cell: `python -m experiments.ant_lr`."""
+    """The command line of a cell: `python -m experiments.ant_lr`.
 
-    def command(
+    The flags are read twice. The first time scale and engine; what they choose is what the flags
+    of the method start from the second time.
+    """
+    description = f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end."
+    with in_sentences():
+        if {"-h", "--help"} & set(sys.argv[1:]):
+            _parse(_settings(method), description)
+            return
+        early, _ = _parse(_early, description, return_unknown_args=True)
+        made = robot(**({} if early.engine is None else {"engine": early.engine}))
+        chosen = resolve(made, method, early)
+        options, given = _parse(_settings(chosen), description)
+        tell(method, chosen, given)
+        report = run_to_the_end(cell_of(made, given, options), options)
+        print((report / "table.txt").read_text(encoding="utf-8"))
+
+
+def _early(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> Options:
+    return options
+
+
+def _settings(method: Direct | Inverse) -> Callable[..., tuple[Options, Direct | Inverse]]:
+    """A function whose parameters are the flags of a cell."""
+
+    def both(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
         method: Direct | Inverse = method,
-    ) -> None:
-        with_engine = {} if options.engine is None else {"engine": options.engine}
-        print(
-            (run_cell(robot(**with_engine), method, options) / "table.txt").read_text(
-                encoding="utf-8"
-            )
-        )
+    ) -> tuple[Options, Direct | Inverse]:
+        return options, method
 
-    guarded(command, f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end.")
+    return both
+
+
+def tell(method: Direct | Inverse, chosen: Direct | Inverse, given: Direct | Inverse) -> None:
+    """Says on stderr which settings are not those of the method, who set them, and the paper's.
+
+    Args:
+      method: with its defaults for the robot.
+      chosen: as scale, engine and machine have it.
+      given: as it is run.
+    """
+    papers = literal(method) if isinstance(method, Inverse) and given.name == method.name else given
+    for who, before, after in (
+        ("chosen for this scale and machine", method, chosen),
+        ("set by you", chosen, given),
+        ("not the paper's (--literal has those)", papers, given),
+    ):
+        changes = [c for c in differences(before, after) if not c.startswith("name ")]
+        if changes:
+            print(f"{given.name}, {who}: {', '.join(changes)}", file=sys.stderr)
+
+
+def differences(before: Any, after: Any) -> list[str]:
+    """Settings that differ, as "name value (value before)"."""
+    was, now = (_dotted(plain(x)) for x in (before, after))
+    return [
+        f"{name} {now.get(name, 'absent')} ({was.get(name, 'absent')})"
+        for name in sorted(was.keys() | now.keys())
+        if was.get(name) != now.get(name)
+    ]
+
+
+def _dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(tree, dict):
+        return {prefix.removesuffix("."): tree}
+    return {
+        k: x for name, part in tree.items() for k, x in _dotted(part, f"{prefix}{name}.").items()
+    }
 
 
 def guarded(command: Callable[..., None], description: str) -> None:
-    """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr.
+    """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr."""
+    with in_sentences():
+        _parse(command, description)
+
+
+def _parse(command: Callable[..., Any], description: str, **how: Any) -> Any:
+    """Calls a function with what the command line says."""
+    return tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,), **how)
+
+
+@contextlib.contextmanager
+def in_sentences() -> Iterator[None]:
+    """Ends the program in one sentence on stderr where its input is bad, or at Ctrl-C.
 
     The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
     """
@@ -229,7 +323,7 @@ def guarded(command: Callable[..., None], description: str) -> None:
     try:
         devices.requested()
         requested_seconds()
-        tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,))
+        yield
     except BadInput as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

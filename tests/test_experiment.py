@@ -282,6 +282,52 @@ def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
     assert scale_of(text, 2_000_000) == scale_of("0.0005", 2_000_000)
 
 
+@pytest.mark.parametrize(
+    ("flags", "name", "value"),
+    [
+        # Each equals a default, or stands beside what would choose another.
+        (("--scale", "quick", "--method.agent.discount", "0.99"), "agent.discount", 0.99),
+        (("--scale", "quick", "--method.agent.lanes", "256"), "agent.discount", 0.97),
+        (("--scale", "quick", "--method.share", "0.5"), "share", 0.5),
+        (("--scale", "0.1", "--method.look-ahead", "80"), "look_ahead", 80),
+        (("--scale", "0.1", "--method.fit.updates", "5000"), "fit.updates", 5000),
+        (
+            (
+                "--scale",
+                "0.1",
+            ),
+            "fit.updates",
+            2000,
+        ),
+        (("--literal", "--method.look-ahead", "7"), "look_ahead", 7),
+        (("--literal", "--method.fit.latent-weight", "0.9"), "fit.latent_weight", 0.9),
+        (("--literal", "--method.generalize.mode", "segments"), "generalize.mode", "segments"),
+        (("--method.generalize.segment", "20"), "generalize.segment", 20),
+    ],
+)
+def test_what_the_user_sets_is_what_is_run(
+    flags: tuple[str, ...], name: str, value: object, monkeypatch, tmp_path: Path
+) -> None:
+    ran: list[cells.Cell] = []
+    (tmp_path / "table.txt").write_text("")
+    monkeypatch.setattr(experiment, "run_to_the_end", lambda c, _: ran.append(c) or tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ant_lr", *flags])
+    experiment.main(Point, methods.LR)
+    made = functools.reduce(getattr, name.split("."), ran[0].method)
+    assert made == value
+
+
+def test_who_has_set_what_is_said(monkeypatch, tmp_path: Path, capsys) -> None:
+    (tmp_path / "table.txt").write_text("")
+    monkeypatch.setattr(experiment, "run_to_the_end", lambda *_: tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lr", "--scale", "0.1", "--method.fit.batch", "64"])
+    experiment.main(Point, methods.LR)
+    chosen, given, papers = capsys.readouterr().err.splitlines()
+    assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
+    assert given == "LR, set by you: fit.batch 64 (512)"
+    assert papers.startswith("LR, not the paper's (--literal has those): fit.averaged False (True)")
+
+
 @pytest.mark.parametrize("seed", [-1, 2**32, 10**30, 1.5])
 def test_seeds_have_32_bits(seed: float) -> None:
     with pytest.raises(BadInput, match="seed must be"):
