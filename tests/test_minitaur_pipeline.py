@@ -52,7 +52,7 @@ def undisturbed(robot: Minitaur) -> tuple[Experience, Any]:
 
 def test_a_record_is_kept_whole(robot: Minitaur, undisturbed: tuple[Experience, Any]) -> None:
     record, _ = undisturbed
-    record.check(robot)
+    record.prepared(robot)
     assert record.s.shape == (STEPS // 16, 16, 17) and record.a.shape == (STEPS // 16, 16, 8)
     assert np.asarray(record.valid).all() and np.asarray(record.first).sum() >= 2 * 16
     at = np.asarray(record.o), np.asarray(record.o_next)
