@@ -315,6 +315,7 @@ def in_sentences() -> Iterator[None]:
     The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
     """
     warnings.showwarning = _warn
+    inherited = os.environ.get("MPLBACKEND")
     # Files are written, no window is opened: not even where Jupyter's backend is inherited.
     os.environ["MPLBACKEND"] = "Agg"
     for stream in (sys.stdout, sys.stderr):
@@ -336,6 +337,10 @@ def in_sentences() -> Iterator[None]:
     except KeyboardInterrupt:
         print("stopped: the same command goes on where it was", file=sys.stderr)
         sys.exit(130)
+    finally:
+        os.environ.pop("MPLBACKEND")
+        if inherited is not None:
+            os.environ["MPLBACKEND"] = inherited
 
 
 def _warn(

@@ -199,13 +199,13 @@ def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"scale": "0.5", "test": {}}', "\x00"])
 def test_what_is_no_summary_spoils_no_report(copy: Path, capsys, content: str) -> None:
-    was = (copy / "point" / "report-0.5" / "table.txt").read_text()
+    was, _, _ = (copy / "point" / "report-0.5" / "table.txt").read_text().partition("Figures in")
     foreign = copy / "point" / "test-theirs" / "done.json"
     foreign.parent.mkdir()
     foreign.write_text(content)
     command(copy)
     said = capsys.readouterr()
-    assert said.out == was + "\n" and f"{foreign} is no summary of a test" in said.err
+    assert said.out.startswith(was) and f"{foreign} is no summary of a test" in said.err
 
 
 @pytest.mark.parametrize(
@@ -491,7 +491,7 @@ def refused(out: Path, capsys, why: str, *flags: str, **options) -> None:
         (("--method.look-ahead", "0"), "look_ahead"),
         (("--method.share", "2"), "share"),
         (("--method.agent.epochs", "0"), "epochs"),
-        (("--episodes", "0"), "at least one"),
+        (("--episodes", "0"), "episodes must be at least 1"),
         (("--test.lanes", "0"), "lanes"),
     ],
 )
@@ -506,7 +506,7 @@ def test_settings_that_cannot_be_are_refused(
     ("flags", "why"),
     [
         (("--method.agent.discount", "1"), "discount"),
-        (("--method.agent.her.goals", "0"), "at least 1 goal"),
+        (("--method.agent.her.goals", "0"), "goals must be at least 1"),
         (("--method.agent.capacity", "7"), "buffer"),
         (("--method.task.reach", "0"), "reach"),
     ],

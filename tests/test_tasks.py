@@ -239,5 +239,5 @@ def test_a_goal_that_cannot_be_reached_is_refused() -> None:
 
 @pytest.mark.parametrize("task", [WalkForward, GoToGoal])
 def test_episodes_without_a_step_are_refused(task) -> None:
-    with pytest.raises(BadInput, match="at least 1 step"):
+    with pytest.raises(BadInput, match="episode_steps must be at least 1"):
         task(episode_steps=0)

@@ -135,7 +135,7 @@ def test_numbers_that_cannot_be_are_refused() -> None:
         with pytest.raises(BadInput, match=said):
             video.film_test(Drawn(), straight(Drawn()), **wrong)
     for wrong in ({"fps": 0.0}, {"width": 2}, {"hold": -1.0}):
-        with pytest.raises(BadInput, match="a shot needs"):
+        with pytest.raises(BadInput, match=next(iter(wrong))):
             Shot(**wrong)
 
 

@@ -91,7 +91,7 @@ def writing(bench: Bench) -> Probe:
     """Writing the record to the disk, as `collect` does now and then."""
     part = bench.once(record)
     chunk = concatenate([part] * -(-CHUNK // part.interactions))
-    call = functools.partial(chunk.save, bench.scratch / "chunk")
+    call = functools.partial(chunk.save, bench.scratch / "chunk", overwrite=True)
     return Probe(timed(call, chunk.interactions), f"{chunk.interactions} steps at a time")
 
 
