@@ -26,11 +26,15 @@ def check(settings: Any, called: Mapping[str, str] | None = None, **allowed: All
     Raises:
       BadInput: the first that may not be what it is.
     """
-    for name, refuse in allowed.items():
-        value = getattr(settings, name)
-        why = refuse(value)
-        if why:
-            raise BadInput(f"{(called or {}).get(name, name)} {why}, not {value!r:.60}")
+    for name, what in allowed.items():
+        check_value((called or {}).get(name, name), getattr(settings, name), what)
+
+
+def check_value(name: str, value: Any, allowed: Allowed) -> None:
+    """Refuses one value outside its range; `name` is what a message calls it."""
+    why = allowed(value)
+    if why:
+        raise BadInput(f"{name} {why}, not {value!r:.60}")
 
 
 def count(least: int = 1, most: int = MOST) -> Allowed:

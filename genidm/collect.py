@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Agent, Learning
-from genidm.checks import count
+from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.experience import Experience, concatenate, load
 from genidm.progress import Progress
@@ -84,9 +84,7 @@ def whole(agent: Agent, interactions: int) -> int:
 
 
 def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
-    why = count()(interactions)
-    if why:
-        raise BadInput(f"interactions {why}, not {interactions}")
+    check_value("interactions", interactions, count())
     if agent.lanes % mesh.size:
         raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
 

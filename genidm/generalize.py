@@ -82,9 +82,9 @@ def replay(
       BadInput: the record is unusable, or holds no physics and the mode needs it.
     """
     settings = (settings or Generalize()).on(robot)
-    experience = experience.prepared(robot)
     if settings.mode == "rotate":
         return rotate(robot, experience, key, settings.copies)
+    experience = experience.prepared(robot)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
     mesh = mesh or robot.mesh()

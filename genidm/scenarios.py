@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from genidm.checks import count
-from genidm.errors import BadInput
+from genidm.checks import check_value, count
 from genidm.robots.base import Robot
 from genidm.tasks import ahead
 
@@ -60,9 +59,8 @@ def scenarios(
       episodes: episodes a seed.
       first_seed: the first of them.
     """
-    for name, number in (("seeds", seeds), ("episodes", episodes)):
-        if count()(number):
-            raise BadInput(f"{name} of a test {count()(number)}, not {number!r}")
+    check_value("seeds of a test", seeds, count())
+    check_value("episodes of a test", episodes, count())
     numbers = jnp.arange(first_seed, first_seed + seeds)
     return _bank(robot, numbers, jnp.arange(episodes))
 

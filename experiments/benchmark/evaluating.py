@@ -72,11 +72,12 @@ def _steered(bench: Bench) -> tuple[State, jax.Array]:
     def watch(_: State, move: Move) -> tuple[State, jax.Array]:
         return move.after, move.action
 
-    def walk(state: State, steps: int) -> tuple[State, jax.Array]:
+    @functools.partial(jax.jit, static_argnums=1)
+    def steer(state: State, steps: int) -> tuple[State, jax.Array]:
         return rollout(robot, act, watch, state, steps=steps)
 
-    middle, _ = jax.jit(walk, static_argnums=1)(jax.jit(robot.reset)(keys, yaw), WARM_UP)
-    return middle, jax.jit(walk, static_argnums=1)(middle, STEPS)[1]
+    middle, _ = steer(jax.jit(robot.reset)(keys, yaw), WARM_UP)
+    return middle, steer(middle, STEPS)[1]
 
 
 def retracing(bench: Bench) -> Probe:
