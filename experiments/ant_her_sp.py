@@ -1,8 +1,8 @@
 """HER_SP on the Ant: one cell of Table 1."""
 
-from genidm.experiment import main
-from genidm.methods import HER_SP
+from genidm.paper.methods import HER_SP
 from genidm.robots import Ant
+from genidm.runs.command import main
 
 if __name__ == "__main__":
     main(Ant, HER_SP)

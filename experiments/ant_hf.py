@@ -1,8 +1,8 @@
 """HF on the Ant: one cell of Table 1."""
 
-from genidm.experiment import main
-from genidm.methods import HF
+from genidm.paper.methods import HF
 from genidm.robots import Ant
+from genidm.runs.command import main
 
 if __name__ == "__main__":
     main(Ant, HF)

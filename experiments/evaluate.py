@@ -7,11 +7,12 @@ from typing import Annotated
 
 import tyro
 
-from genidm.config import environment
-from genidm.evaluate import Test, evaluate
-from genidm.experiment import guarded, saved
-from genidm.report import Row, results, text
-from genidm.scenarios import scenarios
+from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.scenarios import scenarios
+from genidm.provenance import code_of, command, environment
+from genidm.report import Row, origin, results, text
+from genidm.runs.cell import saved
+from genidm.runs.command import guarded
 
 
 def main(
@@ -20,7 +21,7 @@ def main(
     episodes: int = 1000,
     first_seed: int = 0,
     engine: str | None = None,
-    test: Test = Test(),  # noqa: B008
+    test: Test = Test(),
 ) -> None:
     """The paper's test (A.1.3) of controllers, on as many scenarios as you like; keeps nothing.
 
@@ -37,6 +38,8 @@ def main(
     """
     robot, models = saved(runs, engine)
     bank = scenarios(robot, seeds, episodes, first_seed)
+    here = {**environment(), "command": command()}
+    tested = origin(code_of("genidm.evaluation.evaluate", robot, robot.engine), [here])
     rows = [
         Row(
             method=name,
@@ -44,6 +47,7 @@ def main(
             interactions=fitted["interactions"],
             replayed=fitted["replayed"],
             settings=fitted["settings"],
+            made={"test": tested},
         )
         for name, (model, fitted) in models.items()
     ]
@@ -53,7 +57,6 @@ def main(
         engine=robot.engine,
         scale="test",
         scenarios=bank.digest(),
-        environment=environment(),
     )
     print(text(written))
 

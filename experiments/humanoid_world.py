@@ -15,11 +15,12 @@ import numpy as np
 import tyro
 
 from experiments import table1
-from genidm.cells import InverseCell
 from genidm.experience import Experience
-from genidm.experiment import cell, guarded
-from genidm.methods import by_name
+from genidm.paper.methods import by_name
 from genidm.robots import Humanoid, HumanoidWorld
+from genidm.runs.cell import cell
+from genidm.runs.command import guarded
+from genidm.runs.run import InverseCell
 
 METHODS = ("RL", "GE", "LR")
 
@@ -55,7 +56,7 @@ def record(options: table1.Table) -> Experience:
 
 
 def main(
-    options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),  # noqa: B008
+    options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),
 ) -> None:
     """Reads the Humanoid's record in the world's frame, then runs the methods on it."""
     record(options)

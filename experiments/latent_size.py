@@ -8,18 +8,22 @@ from typing import Annotated, Any
 
 import tyro
 
-from genidm import files, stats
-from genidm.cells import InverseCell
-from genidm.config import environment, plain
-from genidm.episodes import Episodes
+from genidm import files
+from genidm.config import plain
 from genidm.errors import BadInput
-from genidm.experiment import Options, announce, bank_of, cell, film_cell, guarded
-from genidm.methods import LR, Inverse
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.scenarios import Scenarios
+from genidm.paper.methods import LR, Inverse
+from genidm.provenance import environment
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
 from genidm.report.runs import Tested
 from genidm.robots import Robot, by_name
-from genidm.scenarios import Scenarios
+from genidm.runs.cell import announce, bank_of, cell, film_cell
+from genidm.runs.command import guarded
+from genidm.runs.resolve import Options
+from genidm.runs.run import InverseCell
 
 KIND = "latent_size"  # of the tests, which are no rows of the table
 

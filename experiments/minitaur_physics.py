@@ -26,9 +26,8 @@ import tyro
 from experiments.minitaur_processes import processes_table, vectorised
 from experiments.physics import metres, table
 from genidm import devices, files, symmetry
-from genidm.config import environment
 from genidm.errors import BadInput
-from genidm.experiment import guarded
+from genidm.provenance import environment
 from genidm.robots import Minitaur
 from genidm.robots.minitaur import from_rows
 from genidm.robots.minitaur_world import (
@@ -39,6 +38,7 @@ from genidm.robots.minitaur_world import (
     parts,
     stepped,
 )
+from genidm.runs.command import guarded
 
 ORIGINAL = Solver(iterations=60, self_collision=True, cone=True)
 OURS = Solver()

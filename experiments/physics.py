@@ -26,14 +26,14 @@ import numpy as np
 import tyro
 
 from genidm import devices, files, symmetry
-from genidm.config import environment
 from genidm.engines import Physics
 from genidm.errors import BadInput
-from genidm.experiment import guarded
 from genidm.progress import Progress, compiled
+from genidm.provenance import environment
 from genidm.robots import Ant, Humanoid, State
 from genidm.robots.base import select
 from genidm.robots.mujoco import MujocoRobot, Solver
+from genidm.runs.command import guarded
 
 ROBOTS = {"ant": Ant, "humanoid": Humanoid}
 

@@ -12,22 +12,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from genidm.cells import Cell
 from genidm.checks import check, count
 from genidm.errors import BadInput
-from genidm.experiment import (
-    Options,
-    announce,
-    bank_of,
-    cell,
-    film_cell,
-    guarded,
-    write_report,
-)  # fmt: skip
-from genidm.methods import EXTRA, ORDER, Direct, Inverse, by_name
+from genidm.evaluation.scenarios import Scenarios
+from genidm.paper.methods import EXTRA, ORDER, Direct, Inverse, by_name
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
-from genidm.scenarios import Scenarios
+from genidm.runs.cell import announce, bank_of, cell, film_cell, write_report
+from genidm.runs.command import guarded
+from genidm.runs.resolve import Options
+from genidm.runs.run import Cell
 
 Methods = Sequence[Direct | Inverse]
 

@@ -9,8 +9,8 @@ import tyro
 
 from genidm import controller
 from genidm.errors import BadInput
-from genidm.evaluate import walking_speed
-from genidm.experiment import guarded
+from genidm.evaluation.evaluate import walking_speed
+from genidm.runs.command import guarded
 
 
 def main(

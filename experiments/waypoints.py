@@ -11,12 +11,13 @@ import numpy as np
 import tyro
 
 from genidm import files
-from genidm.config import environment
 from genidm.errors import BadInput
-from genidm.experiment import guarded, saved
+from genidm.evaluation.waypoints import Follow, Journeys, follow, in_twos
+from genidm.provenance import environment
 from genidm.report import journeys
 from genidm.report.rows import jsonable
-from genidm.waypoints import Follow, Journeys, follow, in_twos
+from genidm.runs.cell import saved
+from genidm.runs.command import guarded
 
 # Metres. It goes ahead, turns both ways, and comes back facing where it started from.
 LOOP = (3.0, 0.0, 5.0, 2.0, 4.0, 5.0, 0.0, 5.0, -2.0, 2.0)
@@ -30,7 +31,7 @@ def main(
     seed: int = 0,
     engine: str | None = None,
     out: Path = Path("runs/waypoints"),
-    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),  # noqa: B008
+    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),
 ) -> None:
     """Leads robots through waypoints, one controller after another from the same starts.
 

@@ -22,9 +22,9 @@ import numpy as np
 
 from genidm import files
 from genidm.agents.sac import SAC
-from genidm.experiment import guarded
-from genidm.methods import HER_SP
+from genidm.paper.methods import HER_SP
 from genidm.robots import Ant
+from genidm.runs.command import guarded
 from genidm.tasks import GoToGoal
 
 try:

@@ -14,7 +14,7 @@ from genidm import files, symmetry
 from genidm.agents.policy import Policy, described
 from genidm.config import plain
 from genidm.errors import BadInput
-from genidm.models import Architecture
+from genidm.paper.idm import Architecture
 from genidm.robots import Robot, by_name
 
 Frame = Literal["world", "heading"]
@@ -71,7 +71,7 @@ class Controller(flax.struct.PyTreeNode):
         """
         s = self.robot.heard(s, displacement)
         s, d = in_frame(self.robot, self.frame, s, direction(displacement))
-        return jnp.clip(self.raw(s, d), -1.0, 1.0)
+        return jnp.clip(self.action(self.latent(s, d)), -1.0, 1.0)
 
     def normalize(self, s: jax.Array) -> jax.Array:
         """States by the statistics of the training data, kept within ±10."""
@@ -81,9 +81,9 @@ class Controller(flax.struct.PyTreeNode):
         """γ `[..., k]` of states and directions in the method's frame (Eq. 3)."""
         return self.architecture.latent(self.params, self.normalize(s), d)
 
-    def raw(self, s: jax.Array, d: jax.Array) -> jax.Array:
-        """Unclipped actions of states and directions in the method's frame (Eq. 1, 4)."""
-        return self.architecture.action(self.params, self.latent(s, d))
+    def action(self, latent: jax.Array) -> jax.Array:
+        """φ(γ) `[..., A]`, not clipped (Eq. 4; Eq. 1 without an LFM)."""
+        return self.architecture.action(self.params, latent)
 
     def fresh(self, key: jax.Array) -> dict[str, Any]:
         """Parameters and statistics of the shapes that these have, not yet fitted."""

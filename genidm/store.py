@@ -1,4 +1,4 @@
-"""Run directories: one a stage, named by its config, found again and resumed."""
+"""Run directories: one a stage, named by its config and its code, found again and resumed."""
 
 from __future__ import annotations
 
@@ -8,46 +8,98 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from genidm.checkpoints import Checkpoints
-from genidm.config import digest, environment
+from genidm.config import digest, plain
+from genidm.errors import BadInput
 from genidm.files import Torn, disk, load_json, remove, save_json
+from genidm.provenance import changed, code_digest, command, environment
 
 # Windows has no such locks: there nobody waits for another process.
 fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
 
+CONFIG, MADE, DONE = "config.json", "made.json", "done.json"
+
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """One part of a run, in a directory that its config names.
+    """One part of a run, in a directory that its config and its code name.
+
+    The directory holds `config.json` (config, and the code of each module), `made.json` (which
+    commands worked on it, where, and for how long) and, once it is finished, `done.json`.
 
     Attributes:
-      directory: `root/name-<digest of the config>`.
+      directory: `root/name-<digest of config and code>`.
     """
 
     directory: Path
 
     @classmethod
-    def open(cls, root: Path | str, name: str, config: Any) -> Stage:
-        """Finds the stage, or makes it, with the config and the environment in `config.json`.
+    def open(
+        cls,
+        root: Path | str,
+        name: str,
+        config: Any,
+        code: Mapping[str, str] | None = None,
+        reuse: bool = False,
+    ) -> Stage:
+        """Finds the stage, or makes its directory.
 
-        One begun in another environment and not finished goes on, with a warning: its bits
-        may differ from those of an undisturbed run.
+        A finished stage of the same config that other code made is not taken for it: it says
+        on stderr which modules differ, and the stage is made anew.
+
+        Args:
+          root: where stages lie.
+          name: first words of the directory's name.
+          config: what tells the stage from others.
+          code: module → digest of the code that the stage runs (`provenance.code_of`).
+          reuse: take a finished stage that other code made, and say so.
         """
-        stage, here = cls(Path(root) / f"{name}-{digest(config)}"), environment()
-        try:
-            begun = load_json(stage.path("config.json"))["environment"]
-        except Torn:
-            save_json(stage.path("config.json"), {"config": config, "environment": here})
-            return stage
-        if begun != here and not stage.done and stage.path("checkpoints").exists():
-            other = ", ".join(f"{k} {begun.get(k)}" for k in here if begun.get(k) != here[k])
-            change = f"{stage.directory} was begun elsewhere ({other})"
-            print(f"warning: {change}; bits may differ from one machine's", file=sys.stderr)
+        code = dict(code or {})
+        key = {"config": config, "code": code_digest(code)} if code else config
+        stage = cls(Path(root) / f"{name}-{digest(key)}")
+        if not stage.done:
+            other = stage._of_other_code(name, config, code)
+            if other and reuse:
+                print(f"warning: {_differs(other, code)}; it is used", file=sys.stderr)
+                return other
+            if other and not stage.path(CONFIG).exists():
+                print(f"{_differs(other, code)}: made anew", file=sys.stderr)
+        if not _is_json(stage.path(CONFIG)):
+            save_json(stage.path(CONFIG), {"config": config, "code": code})
         return stage
+
+    def _of_other_code(self, name: str, config: Any, code: Mapping[str, str]) -> Stage | None:
+        """The newest finished stage of the same config that other code made."""
+        wanted, found = plain(config), []
+        for path in self.directory.parent.glob(f"{name}-*/{DONE}"):
+            other = Stage(path.parent)
+            with contextlib.suppress(BadInput, KeyError, TypeError):
+                there = load_json(other.path(CONFIG))
+                if there["config"] == wanted and there["code"] != code:
+                    found.append((path.stat().st_mtime, other))
+        return max(found, key=lambda pair: pair[0])[1] if found else None
+
+    @property
+    def code(self) -> dict[str, str]:
+        """Module → digest of the code that made the stage."""
+        code: dict[str, str] = load_json(self.path(CONFIG))["code"]
+        return code
+
+    @property
+    def made(self) -> list[dict[str, Any]]:
+        """Which commands have worked on the stage, oldest first.
+
+        Each with its command, commit, clean, versions, hardware, and start and seconds: when it
+        began, in seconds since 1970, and for how long it worked (None of one that was killed).
+        """
+        path = self.path(MADE)
+        sessions: list[dict[str, Any]] = load_json(path) if path.exists() else []
+        return sessions
 
     @property
     def done(self) -> bool:
@@ -60,7 +112,7 @@ class Stage:
     def summary(self) -> Any:
         """What `finish` was given; raises Torn if the stage is not finished."""
         try:
-            return load_json(self.path("done.json"))
+            return load_json(self.path(DONE))
         except Torn as torn:
             raise Torn(f"{self.directory} is not the directory of a finished run: {torn}") from None
 
@@ -72,14 +124,35 @@ class Stage:
         """
         if self.done:
             return
-        with _alone(self.directory):
+        with alone(self.directory):
             if not self.done:
-                self.finish(work())
+                begun = self._begin()
+                summary = work()
+                self._end(begun)
+                self.finish(summary)
                 self.clear_checkpoints()
+
+    def _begin(self) -> float:
+        """Writes down who begins to work; says so where a part of the work is another machine's."""
+        sessions, here = self.made, environment()
+        if sessions and self.path("checkpoints").exists():
+            before = sessions[-1]
+            other = ", ".join(f"{k} {before.get(k)}" for k in here if before.get(k) != here[k])
+            if other:
+                change = f"{self.directory} was begun elsewhere ({other})"
+                print(f"warning: {change}; bits may differ from one machine's", file=sys.stderr)
+        start = round(time.time(), 3)
+        now = {"command": command(), **here, "start": start, "seconds": None}
+        save_json(self.path(MADE), [*sessions, now])
+        return start
+
+    def _end(self, begun: float) -> None:
+        *before, now = self.made
+        save_json(self.path(MADE), [*before, now | {"seconds": round(time.time() - begun, 1)}])
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Marks the stage as finished; the last thing done to it."""
-        save_json(self.path("done.json"), summary)
+        save_json(self.path(DONE), summary)
 
     def path(self, name: str) -> Path:
         """Where the stage keeps the file or directory `name`."""
@@ -95,8 +168,21 @@ class Stage:
             remove(self.path("checkpoints"))
 
 
+def _is_json(path: Path) -> bool:
+    try:
+        return bool(load_json(path))
+    except Torn:
+        return False
+
+
+def _differs(other: Stage, code: Mapping[str, str]) -> str:
+    modules = changed(other.code, code)
+    named = ", ".join(modules[:5]) + (f" and {len(modules) - 5} more" if len(modules) > 5 else "")
+    return f"{other.directory} was made by other code ({named})"
+
+
 @contextlib.contextmanager
-def _alone(directory: Path) -> Iterator[None]:
+def alone(directory: Path) -> Iterator[None]:
     """Holds the lock of a directory; goes without where the file system has none."""
     if fcntl is None:
         yield

@@ -25,8 +25,8 @@ from experiments.benchmark.comparing import Row
 from experiments.benchmark.measuring import Probe, Skip, interleave, timed
 from experiments.benchmark.rows import ANT, HUMANOID, ROWS, choose
 from genidm.errors import BadInput
-from genidm.methods import GE, LR
-from genidm.models import Architecture
+from genidm.paper.idm import Architecture
+from genidm.paper.methods import GE, LR
 from genidm.robots import Ant
 from genidm.robots.mujoco import Solver
 

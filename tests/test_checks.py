@@ -17,13 +17,13 @@ from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
 from genidm.checks import count, layers, number, optional, positive
 from genidm.errors import BadInput
-from genidm.evaluate import Test
-from genidm.fit import Fit
-from genidm.generalize import Generalize
-from genidm.methods import LR, VGCP
+from genidm.evaluation.evaluate import Test
+from genidm.evaluation.waypoints import Follow
+from genidm.paper.fit import Fit
+from genidm.paper.generalize import Generalize
+from genidm.paper.methods import LR, VGCP
 from genidm.tasks import Dense, GoToGoal, WalkForward
 from genidm.video import Shot
-from genidm.waypoints import Follow
 
 SETTINGS = [
     PPO(), SAC(), DDPG(), HER(), RandomActions(), Frozen(PPO(), 0.5), Fit(), Test(), Generalize(),

@@ -8,7 +8,6 @@ import json
 import re
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,8 +46,8 @@ class Other:
 def test_plain_is_readable_json() -> None:
     plain = config.plain({"c": Config(), "f": jnp.tanh, "x": np.float32(0.5), "bad": np.inf})
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
-    assert plain["c"]["class"].endswith("test_config.Config")
-    assert plain["c"]["inner"]["colour"].endswith("Colour.RED")
+    assert plain["c"]["class"] == "Config"
+    assert plain["c"]["inner"]["colour"] == "Colour.RED"
     assert plain["c"]["path"] == "a/b"
     assert (plain["x"], plain["bad"]) == (0.5, "inf")
 
@@ -74,11 +73,3 @@ def test_digest_sees_every_difference_and_nothing_else() -> None:
 def test_digest_refuses_what_it_cannot_tell_apart() -> None:
     with pytest.raises(BadInput, match="cannot stand in a config"):
         config.digest({"robot": object()})
-
-
-def test_environment_names_versions_and_hardware() -> None:
-    here = config.environment()
-    assert here["versions"]["jax"] == jax.__version__
-    assert f"{jax.device_count()} jax devices" in here["hardware"]
-    assert here["commit"] is None or re.fullmatch("[0-9a-f]{40}", here["commit"])
-    assert json.loads(json.dumps(here)) == here

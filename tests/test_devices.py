@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 from point import Point
 
-from genidm import devices, methods
+from genidm import devices
 from genidm.agents.frozen import Frozen
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
-from genidm.evaluate import Test, flatten
-from genidm.evaluator import Evaluator
-from genidm.experiment import Options, cell
-from genidm.fit import Fit, fit
-from genidm.pairs import Pairs
+from genidm.evaluation.evaluate import Test, flatten
+from genidm.evaluation.evaluator import Evaluator
+from genidm.evaluation.scenarios import scenarios
+from genidm.paper import methods
+from genidm.paper.fit import Fit, fit
+from genidm.paper.pairs import Pairs
 from genidm.robots import Humanoid
-from genidm.scenarios import scenarios
+from genidm.runs.cell import cell
+from genidm.runs.resolve import Options
 from genidm.tasks import WalkForward
 
 GB = 10**9

@@ -15,13 +15,13 @@ import pytest
 from in_c import step_in_c
 
 from genidm import engines
+from genidm.agents.collect import collect
 from genidm.agents.ppo import PPO
-from genidm.collect import collect
 from genidm.engines import ENGINES, Physics, Stepped
 from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
 from genidm.experience import Experience
-from genidm.generalize import Generalize, replay, residual
+from genidm.paper.generalize import Generalize, replay, residual
 from genidm.robots import Ant, Humanoid, by_name
 from genidm.robots.mujoco import MujocoRobot
 

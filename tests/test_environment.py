@@ -22,7 +22,7 @@ def python(code: str, *, cwd: Path = ROOT, **env: str | None) -> subprocess.Comp
 
 CACHE = "import genidm.devices, jax; print(jax.config.jax_compilation_cache_dir)"
 COMMAND = (
-    "from genidm.experiment import guarded\n"
+    "from genidm.runs.command import guarded\n"
     "def run() -> None:\n    print('ran ≤')\n"
     "guarded(run, 'A command.')"
 )

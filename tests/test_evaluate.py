@@ -14,13 +14,14 @@ import pytest
 from killing import Killed, dies_at
 from point import Point, Straight
 
-from genidm import checkpoints, devices, stats
-from genidm.episodes import Episodes
+from genidm import checkpoints, devices
 from genidm.errors import BadInput
-from genidm.evaluate import Test, evaluate, flatten, run
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.evaluate import Test, evaluate, flatten, run
+from genidm.evaluation.scenarios import Scenarios, scenarios, tours
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import State
-from genidm.scenarios import Scenarios, scenarios, tours
 from genidm.store import Stage
 
 SEEDS, EPISODES = 2, 15

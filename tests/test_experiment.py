@@ -31,22 +31,27 @@ from point import Point
 from tiny import TEST, tiny
 
 from experiments import evaluate, walk, waypoints
-from genidm import cells, controller, experiment, methods, stats
-from genidm import collect as collecting
+from genidm import controller
+from genidm.agents import collect as collecting
 from genidm.agents.policy import Policy
-from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.experiment import Options, cell, run_cell
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.scenarios import scenarios
+from genidm.evaluation.waypoints import Follow
 from genidm.files import load_arrays, save_arrays
-from genidm.generalize import Generalize
-from genidm.methods import Inverse, Method, literal
+from genidm.paper import methods
+from genidm.paper.generalize import Generalize
+from genidm.paper.methods import Inverse, Method, literal
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur, Robot
-from genidm.scale import Scale, scale_of
-from genidm.scenarios import scenarios
+from genidm.runs import command as experiment
+from genidm.runs import run as cells
+from genidm.runs.cell import cell, run_cell
+from genidm.runs.resolve import Options
+from genidm.runs.scale import Scale, scale_of
 from genidm.store import Stage
 from genidm.tasks import WalkForward
-from genidm.waypoints import Follow
 
 
 def small(method: Inverse) -> Inverse:

@@ -15,10 +15,10 @@ from point import Point
 from genidm import checkpoints, controller, files, symmetry
 from genidm.controller import Controller, in_frame
 from genidm.errors import BadInput
-from genidm.fit import Fit, draw_plain, draw_siamese, fit, loss_plain, loss_siamese
-from genidm.methods import LR
-from genidm.models import Architecture
-from genidm.pairs import Pairs
+from genidm.paper.fit import Fit, draw_plain, draw_siamese, fit
+from genidm.paper.idm import Architecture, loss_plain, loss_siamese
+from genidm.paper.methods import LR
+from genidm.paper.pairs import Pairs
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import Ant
 from genidm.store import Stage

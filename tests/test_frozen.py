@@ -13,16 +13,18 @@ from killing import Killed, dies_at
 from point import Point
 from tiny import AGENTS, TEST, tiny
 
-from genidm import collect as collecting
-from genidm import devices, methods
+from genidm import devices
+from genidm.agents import collect as collecting
+from genidm.agents.collect import collect
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.ppo import PPO
 from genidm.agents.sac import SAC
-from genidm.collect import collect
 from genidm.errors import BadInput
-from genidm.experiment import Options, cell
+from genidm.evaluation.scenarios import scenarios
+from genidm.paper import methods
 from genidm.progress import Progress
-from genidm.scenarios import scenarios
+from genidm.runs.cell import cell
+from genidm.runs.resolve import Options
 from genidm.tasks import WalkForward
 
 TASK = WalkForward(episode_steps=20)

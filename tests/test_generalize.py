@@ -12,14 +12,14 @@ import pytest
 from point import Point
 
 from genidm import devices, experience, symmetry
+from genidm.agents.collect import collect
 from genidm.agents.random import RandomActions
-from genidm.collect import collect
 from genidm.controller import in_frame
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
-from genidm.generalize import Generalize, generalize, replay, residual
-from genidm.pairs import pairs, with_reflection
-from genidm.replaying import Replay
+from genidm.paper.generalize import Generalize, generalize, replay, residual
+from genidm.paper.pairs import pairs, with_reflection
+from genidm.paper.replaying import Replay
 from genidm.robots import Ant
 from genidm.tasks import WalkForward
 

@@ -19,10 +19,12 @@ from experiments.gpu import __main__ as command
 from experiments.gpu import cells, children, jobs, speeds
 from experiments.gpu.children import Ended
 from experiments.gpu.results import Results
-from genidm import cells as stages
-from genidm import experiment, methods, robots
+from genidm import robots
 from genidm.agents.random import RandomActions
-from genidm.experiment import guarded
+from genidm.paper import methods
+from genidm.runs import command as experiment
+from genidm.runs import run as stages
+from genidm.runs.command import guarded
 
 CALL = {"minutes": 1, "environment": {"versions": {}, "hardware": "a machine", "commit": None}}
 

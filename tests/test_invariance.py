@@ -10,10 +10,10 @@ import pytest
 from point import Point, Straight
 
 from genidm.controller import Controller
+from genidm.evaluation.invariance import ANGLES, invariance, probes
 from genidm.experience import Experience
-from genidm.fit import Fit, training
-from genidm.invariance import ANGLES, invariance, probes
-from genidm.pairs import Pairs
+from genidm.paper.fit import Fit, training
+from genidm.paper.pairs import Pairs
 from genidm.robots import Ant, Robot
 
 

@@ -15,12 +15,14 @@ from tiny import AGENTS, TEST, tiny
 
 from experiments import latent_size
 from experiments.latent_size import KIND, Sweep, cells, run, sized, text
-from genidm import cells as stages
-from genidm import files, methods, robots
+from genidm import files, robots
 from genidm.agents.random import RandomActions
 from genidm.errors import BadInput
-from genidm.experiment import bank_of, cell, guarded
+from genidm.paper import methods
 from genidm.report.runs import find
+from genidm.runs import run as stages
+from genidm.runs.cell import bank_of, cell
+from genidm.runs.command import guarded
 
 LR = tiny(methods.LR, agent=AGENTS[RandomActions])
 

@@ -14,10 +14,10 @@ from tiny import tiny
 from genidm import controller, files, symmetry
 from genidm.errors import BadInput
 from genidm.experience import Experience, load
-from genidm.fit import fit
-from genidm.generalize import Generalize, generalize
-from genidm.methods import LR
-from genidm.pairs import Pairs
+from genidm.paper.fit import fit
+from genidm.paper.generalize import Generalize, generalize
+from genidm.paper.methods import LR
+from genidm.paper.pairs import Pairs
 from genidm.robots import Logged
 from genidm.symmetry import Layout
 

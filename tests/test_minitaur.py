@@ -22,8 +22,9 @@ from original_minitaur import AFTER, RECORD, actions, original
 
 from genidm import devices, symmetry
 from genidm.errors import BadInput
-from genidm.evaluate import Test, flatten
-from genidm.evaluator import Evaluator
+from genidm.evaluation.evaluate import Test, flatten
+from genidm.evaluation.evaluator import Evaluator
+from genidm.evaluation.scenarios import scenarios
 from genidm.robots import Minitaur, State, by_name
 from genidm.robots.minitaur import Physics, from_rows
 from genidm.robots.minitaur_world import (
@@ -36,7 +37,6 @@ from genidm.robots.minitaur_world import (
     parts,
     stepped,
 )
-from genidm.scenarios import scenarios
 from genidm.tasks import WalkForward
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no wheel of it here")

@@ -16,16 +16,16 @@ from bits import same
 from killing import Killed, dies_at
 from tiny import AGENTS, TEST
 
-from genidm import collect as collecting
+from genidm.agents import collect as collecting
+from genidm.agents.collect import collect
 from genidm.agents.ppo import PPO
 from genidm.agents.sac import SAC
-from genidm.collect import collect
-from genidm.evaluate import evaluate
+from genidm.evaluation.evaluate import evaluate
+from genidm.evaluation.scenarios import scenarios
 from genidm.experience import Experience
-from genidm.generalize import Generalize, replay, residual
+from genidm.paper.generalize import Generalize, replay, residual
 from genidm.progress import Progress
 from genidm.robots import Minitaur
-from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import GoToGoal, WalkForward
 

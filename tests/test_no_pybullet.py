@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from genidm import experiment
 from genidm.errors import BadInput
-from genidm.methods import by_name
+from genidm.paper.methods import by_name
 from genidm.robots import Minitaur
+from genidm.runs import command as experiment
 
 
 @pytest.fixture

@@ -23,21 +23,21 @@ from killing import Killed, dies_at
 from point import Point
 from prepared import Prepared
 
-from genidm import collect as collecting
 from genidm import devices, tasks
+from genidm.agents import collect as collecting
 from genidm.agents import walking
+from genidm.agents.collect import collect
 from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.policy import no_statistics, normalize
 from genidm.agents.sac import SAC
-from genidm.collect import collect
 from genidm.errors import BadInput
-from genidm.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.scenarios import scenarios
 from genidm.experience import load_chunks
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import Robot, State
-from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import GoToGoal, Lanes, Sparse, Step, Task, Verdict, WalkForward, inputs
 

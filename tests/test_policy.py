@@ -25,9 +25,9 @@ from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
 from genidm.controller import Controller
 from genidm.errors import BadInput
-from genidm.evaluate import walking_speed
+from genidm.evaluation.evaluate import walking_speed
 from genidm.files import Torn
-from genidm.models import Architecture
+from genidm.paper.idm import Architecture
 from genidm.tasks import GoToGoal, Task, WalkForward, inputs
 
 ROBOT = Point()

@@ -19,19 +19,19 @@ from killing import Killed, dies_at
 from point import Point
 from prepared import Prepared
 
-from genidm import collect as collecting
 from genidm import devices
+from genidm.agents import collect as collecting
 from genidm.agents import ppo, walking
+from genidm.agents.collect import collect
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.walking import walk
-from genidm.collect import collect
 from genidm.errors import BadInput
-from genidm.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.scenarios import scenarios
 from genidm.experience import Experience, load_chunks
 from genidm.files import Torn
 from genidm.progress import METRICS, Progress, read_metrics
-from genidm.scenarios import scenarios
 from genidm.store import Stage
 from genidm.tasks import GoToGoal, Step, WalkForward
 

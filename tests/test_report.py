@@ -9,8 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from genidm import report, stats
-from genidm.episodes import Episodes
+from genidm import report
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
 from genidm.report import drawing, figures, table
 
 METHODS = {"RS": 3.0, "RL": 2.0, "GE": 1.0, "LR": 0.6, "HF": 0.3}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from genidm import stats
-from genidm.episodes import Episodes
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
 
 
 def outcome(closest, *, start=None, fell=False, diverged=False, reached=False) -> Episodes:

@@ -7,17 +7,20 @@ import fcntl
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bits import truncate
+from killing import Killed
 from test_config import Config, Other
 
 from genidm import store
-from genidm.config import digest, environment, plain
+from genidm.config import digest, plain
 from genidm.files import load_json
+from genidm.provenance import environment
 from genidm.store import Stage
 
 
@@ -26,7 +29,7 @@ def test_a_stage_is_found_again_and_knows_whether_it_is_done(tmp_path: Path) -> 
     assert stage.directory == tmp_path / f"collect-{digest(Config())}"
     config = load_json(stage.path("config.json"))
     assert config["config"] == plain(Config())
-    assert config["environment"] == environment()
+    assert config["code"] == {}
     assert not stage.done
     stage.checkpoints().save(3, {"a": 1})
     assert Stage.open(tmp_path, "collect", Config()).checkpoints().steps() == [3]
@@ -47,17 +50,67 @@ def test_a_torn_done_is_not_done(tmp_path: Path) -> None:
 
 
 def test_a_stage_resumed_elsewhere_warns(tmp_path: Path, monkeypatch, capfd) -> None:
-    here = environment()
     stage = Stage.open(tmp_path, "fit", {})
-    stage.checkpoints().save(1, {"a": 1})
-    Stage.open(tmp_path, "fit", {})
+
+    def dies() -> dict[str, int]:
+        stage.checkpoints().save(1, {"a": 1})
+        raise Killed
+
+    for _ in range(2):
+        with pytest.raises(Killed):
+            stage.once(dies)
     assert "warning" not in capfd.readouterr().err
+    here = environment()
     monkeypatch.setattr(store, "environment", lambda: {**here, "hardware": "another"})
-    Stage.open(tmp_path, "fit", {})
+    stage.once(lambda: {})
     assert "bits may differ" in capfd.readouterr().err
-    stage.finish({})
-    Stage.open(tmp_path, "fit", {})
-    assert "warning" not in capfd.readouterr().err
+    assert [session["hardware"] for session in stage.made] == [here["hardware"]] * 2 + ["another"]
+
+
+def test_a_stage_says_who_made_it_and_how_long_it_took(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("sys.argv", ["run me", "--seed", "1"])
+    stage = Stage.open(tmp_path, "fit", {})
+    stage.once(lambda: time.sleep(0.2) or {})
+    (session,) = stage.made
+    assert session["command"].endswith("--seed 1")
+    assert {name: session[name] for name in environment()} == environment()
+    assert 0.2 <= session["seconds"] < 5
+    assert abs(session["start"] - time.time()) < 60
+
+
+OLD, NEW = {"genidm.paper.fit": "aaaa"}, {"genidm.paper.fit": "bbbb"}
+
+
+def test_a_stage_of_other_code_is_made_anew_and_said(tmp_path: Path, capfd) -> None:
+    old = Stage.open(tmp_path, "LR-0", {"k": 10}, OLD)
+    old.once(lambda: {"by": "old"})
+    assert Stage.open(tmp_path, "LR-0", {"k": 10}, OLD) == old
+    assert capfd.readouterr().err == ""
+    new = Stage.open(tmp_path, "LR-0", {"k": 10}, NEW)
+    said = capfd.readouterr().err
+    assert new != old and not new.done
+    assert f"{old.directory} was made by other code (genidm.paper.fit)" in said
+    assert Stage.open(tmp_path, "LR-0", {"k": 11}, NEW).directory not in (old, new)
+    assert capfd.readouterr().err == "", "another config is another stage, and no news"
+    new.once(lambda: {"by": "new"})
+    assert old.summary() == {"by": "old"}
+
+
+def test_a_stage_of_other_code_is_used_where_the_user_says_so(tmp_path: Path, capfd) -> None:
+    old = Stage.open(tmp_path, "LR-0", {"k": 10}, OLD)
+    half = Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True)
+    assert half != old, "one that is not finished is not used"
+    old.once(lambda: {"by": "old"})
+    assert Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True) == old
+    assert "warning" in (said := capfd.readouterr().err) and "it is used" in said
+    half.once(lambda: {"by": "new"})
+    assert Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True) == half
+
+
+def test_a_checkpoint_of_other_code_is_not_gone_on_from(tmp_path: Path) -> None:
+    Stage.open(tmp_path, "LR-0", {}, OLD).checkpoints().save(1, {"a": 1})
+    assert Stage.open(tmp_path, "LR-0", {}, NEW).checkpoints().steps() == []
+    assert Stage.open(tmp_path, "LR-0", {}, OLD).checkpoints().steps() == [1]
 
 
 def test_work_is_done_once_and_its_checkpoints_go(tmp_path: Path) -> None:
@@ -85,6 +138,7 @@ def test_work_that_fails_is_not_done_and_can_be_done_again(tmp_path: Path) -> No
 
 HOLDS = """
 import sys, time
+from genidm.provenance import environment
 from genidm.store import Stage
 def work():
     print("at work", flush=True)

@@ -20,13 +20,16 @@ from tiny import AGENTS, TEST, tiny
 
 from experiments import table1
 from experiments.table1 import Table, chosen, grouped, run, work
-from genidm import cells, experiment, files, methods, robots
+from genidm import files, robots
 from genidm.agents.random import RandomActions
 from genidm.errors import BadInput
-from genidm.experiment import guarded
+from genidm.evaluation.scenarios import scenarios
+from genidm.paper import methods
 from genidm.progress import Progress
 from genidm.report import shown
-from genidm.scenarios import scenarios
+from genidm.runs import command as experiment
+from genidm.runs import run as cells
+from genidm.runs.command import guarded
 
 # One record for all that learn from one, and one policy.
 RECORD = dict(agent=AGENTS[RandomActions])

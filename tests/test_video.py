@@ -18,21 +18,24 @@ from PIL import Image
 from point import Physics, Point, Straight
 from tiny import TEST, tiny
 
-from genidm import methods, robots, video
+from genidm import robots, video
 from genidm.config import plain
 from genidm.errors import BadInput
-from genidm.experiment import Options, guarded, run_cell
+from genidm.evaluation.scenarios import scenarios
+from genidm.evaluation.waypoints import Follow
 from genidm.files import load_arrays, save_json
+from genidm.paper import methods
 from genidm.robots import Ant, HumanoidWorld, Logged, remade
 from genidm.robots.mujoco import Solver
-from genidm.scenarios import scenarios
+from genidm.runs.cell import run_cell
+from genidm.runs.command import guarded
+from genidm.runs.resolve import Options
 from genidm.store import Stage
 from genidm.video import Film, Shot, Take, backends, clip, recorded, shooting
 from genidm.video.__main__ import main
 from genidm.video.filming import LONGEST, robot_of
 from genidm.video.pages import FPS, contents
 from genidm.video.scenery import FLOOR_NAME, REACHED, TO_GO, scene
-from genidm.waypoints import Follow
 
 
 class Drawn(Point):

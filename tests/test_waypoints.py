@@ -13,8 +13,8 @@ from point import Point, Straight
 
 from genidm import devices
 from genidm.errors import BadInput
+from genidm.evaluation.waypoints import Follow, Journeys, follow, straight
 from genidm.report.journeys import journeys
-from genidm.waypoints import Follow, Journeys, follow, straight
 
 WAYPOINTS = np.array([[2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
 SETTINGS = Follow(max_steps=300, reach=0.2, chunk=40)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from genidm.methods import HER_SP
+from genidm.paper.methods import HER_SP
 from genidm.tasks import GoToGoal
 
 for module in ("gymnasium.envs.mujoco", "torch", "stable_baselines3"):

@@ -10,9 +10,9 @@ from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
-from genidm.evaluate import Test
-from genidm.generalize import Generalize
-from genidm.methods import Direct, Inverse
+from genidm.evaluation.evaluate import Test
+from genidm.paper.generalize import Generalize
+from genidm.paper.methods import Direct, Inverse
 
 M = TypeVar("M", Direct, Inverse)
 

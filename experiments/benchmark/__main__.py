@@ -14,8 +14,8 @@ from experiments.benchmark.evaluating import controller
 from experiments.benchmark.rows import ROWS, choose
 from genidm import files
 from genidm.errors import BadInput
-from genidm.experiment import guarded
 from genidm.robots import Robot, by_name
+from genidm.runs.command import guarded
 
 
 def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
@@ -53,7 +53,7 @@ def main() -> None:
     """The command line."""
 
     def command(
-        options: Annotated[Options, tyro.conf.arg(name="")] = Options(),  # noqa: B008
+        options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
     ) -> None:
         print(table(benchmark(by_name(options.robot, options.engine), options)))
 

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
-from genidm.evaluate import Test
+from genidm.evaluation.evaluate import Test
 from genidm.robots import Robot
 
 T = TypeVar("T")

@@ -17,11 +17,11 @@ from genidm import devices
 from genidm.agents import walking as steps
 from genidm.agents.alternating import Alternating, Learner
 from genidm.agents.base import Agent, Iterate, Learning
+from genidm.agents.collect import CHUNK, collect
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.off_policy import OffPolicy
-from genidm.collect import CHUNK, collect
 from genidm.experience import Experience, concatenate
-from genidm.methods import LR, RL, RS, Method
+from genidm.paper.methods import LR, RL, RS, Method
 from genidm.tasks import Step
 
 

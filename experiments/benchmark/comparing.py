@@ -17,8 +17,8 @@ from tqdm.auto import tqdm
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, Skip, interleave
 from experiments.benchmark.sb3 import Ended
-from genidm import config
 from genidm.progress import Progress
+from genidm.provenance import environment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _result(
         "unit": row.unit,
         "ratio_to": full(base) if base else None,
         "ratio": _rounded(ratios[row.name]) if base else None,
-        "hardware": config.environment()["hardware"],
+        "hardware": environment()["hardware"],
     }
 
 

@@ -16,17 +16,17 @@ from experiments.benchmark.stepping import STEPS, among, place, step_batch, walk
 from genidm import devices
 from genidm.controller import load
 from genidm.engines.mujoco import MuJoCo
-from genidm.evaluate import Steering, Test, evaluate, flatten
-from genidm.evaluator import Evaluator, Queue
-from genidm.fit import fit
-from genidm.generalize import rotate
-from genidm.methods import LR
-from genidm.pairs import pairs
+from genidm.evaluation.evaluate import Steering, Test, evaluate, flatten
+from genidm.evaluation.evaluator import Evaluator, Queue
+from genidm.evaluation.scenarios import Scenarios, scenarios
+from genidm.paper.fit import fit
+from genidm.paper.generalize import rotate
+from genidm.paper.methods import LR
+from genidm.paper.pairs import pairs
 from genidm.progress import METRICS, read_metrics
 from genidm.robots import State
 from genidm.robots.mujoco import MujocoRobot
 from genidm.rollout import Move, rollout
-from genidm.scenarios import Scenarios, scenarios
 from genidm.store import Stage
 
 # Steps before `retracing`'s: by then they walk.

@@ -14,8 +14,8 @@ import numpy as np
 
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, carried, timed
-from genidm.fit import Fit, training
-from genidm.pairs import Pairs
+from genidm.paper.fit import Fit, training
+from genidm.paper.pairs import Pairs
 from genidm.robots import Robot
 
 Shape = tuple[int, int]

@@ -9,8 +9,8 @@ import jax
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.collecting import record, segment
 from experiments.benchmark.measuring import Probe, carried, timed
+from genidm.paper.replaying import Blocks, Runner
 from genidm.progress import Progress
-from genidm.replaying import Blocks, Runner
 
 
 def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:

@@ -23,7 +23,7 @@ from experiments.benchmark.starting import starting
 from experiments.benchmark.stepping import batch, limit, stepping
 from genidm.agents.frozen import Frozen
 from genidm.errors import BadInput
-from genidm.methods import GE, HER_DE, HER_SP, LR, RL, RS, Inverse, Method, by_name
+from genidm.paper.methods import GE, HER_DE, HER_SP, LR, RL, RS, Inverse, Method, by_name
 
 
 def _of_humanoid(name: str) -> Inverse:

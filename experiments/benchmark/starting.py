@@ -15,8 +15,8 @@ import jax.monitoring
 
 from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, Skip
-from genidm.collect import collect
-from genidm.methods import RL
+from genidm.agents.collect import collect
+from genidm.paper.methods import RL
 from genidm.robots import by_name
 
 

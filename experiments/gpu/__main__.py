@@ -20,9 +20,9 @@ from experiments.gpu.jobs import Job
 from experiments.gpu.results import Results, Row
 from genidm.engines import ENGINES
 from genidm.errors import BadInput
-from genidm.experiment import guarded
 from genidm.progress import METRICS, read_metrics
 from genidm.robots import ROBOTS
+from genidm.runs.command import guarded
 
 # Robot → its cells of the paper's scale, in order. Cells that share a record follow each other.
 CELLS = {"ant": ("LR", "GE", "RL", "HF")}

@@ -14,12 +14,13 @@ import numpy as np
 from experiments.benchmark.starting import compiling
 from experiments.gpu.results import Results
 from genidm import files
-from genidm.cells import Cell, InverseCell
-from genidm.evaluate import Test
-from genidm.experiment import Options, bank_of, cell, run_cell
-from genidm.methods import Inverse, by_name
+from genidm.evaluation.evaluate import Test
+from genidm.evaluation.scenarios import Scenarios
+from genidm.paper.methods import Inverse, by_name
 from genidm.robots import Robot
-from genidm.scenarios import Scenarios
+from genidm.runs.cell import bank_of, cell, run_cell
+from genidm.runs.resolve import Options
+from genidm.runs.run import Cell, InverseCell
 from genidm.store import Stage
 
 # Interactions of the tiny cell: an off-policy learner makes its first updates before they end.

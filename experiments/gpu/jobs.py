@@ -15,12 +15,13 @@ import jax
 from experiments.gpu import cells, children, speeds
 from experiments.gpu.results import Results, Row
 from genidm import devices
-from genidm.config import environment
 from genidm.engines import ENGINES, choose
-from genidm.experiment import Options, bank_of, cell, write_report
-from genidm.methods import by_name
+from genidm.paper.methods import by_name
+from genidm.provenance import environment
 from genidm.robots import ROBOTS, Robot
 from genidm.robots import by_name as robot_by_name
+from genidm.runs.cell import bank_of, cell, write_report
+from genidm.runs.resolve import Options
 
 
 @dataclasses.dataclass(frozen=True)

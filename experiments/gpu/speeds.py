@@ -17,13 +17,13 @@ from experiments.benchmark.measuring import carried
 from experiments.gpu.results import Row
 from genidm import devices
 from genidm.controller import Controller
-from genidm.evaluate import Test, flatten
-from genidm.evaluator import Evaluator, Queue
-from genidm.methods import LR
-from genidm.models import Architecture
-from genidm.replaying import Runner
+from genidm.evaluation.evaluate import Test, flatten
+from genidm.evaluation.evaluator import Evaluator, Queue
+from genidm.evaluation.scenarios import scenarios
+from genidm.paper.idm import Architecture
+from genidm.paper.methods import LR
+from genidm.paper.replaying import Runner
 from genidm.robots import Robot, State
-from genidm.scenarios import scenarios
 
 # Engine → numbers of lanes. Others, of a robot that steps itself, are measured as MuJoCo in C.
 LANES = {"mjx": (128, 512, 2048, 8192), "mujoco": (128, 512)}

@@ -1,5 +1,6 @@
 """Tables and figures from episodes: everything here derives from what the evaluation left."""
 
+from genidm.paper.protocol import TABLE1
 from genidm.report.figures import (
     bearings,
     invariance,
@@ -10,8 +11,7 @@ from genidm.report.figures import (
     violins,
 )
 from genidm.report.journeys import journeys
-from genidm.report.paper import TABLE1
-from genidm.report.rows import Row, results
+from genidm.report.rows import Row, origin, results
 from genidm.report.table import markdown, text
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "latent_sizes",
     "learning_curves",
     "markdown",
+    "origin",
     "paths",
     "residuals",
     "results",

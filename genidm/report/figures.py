@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.ticker import EngFormatter, FuncFormatter, NullLocator
 
-from genidm import stats
+from genidm.evaluation import stats
+from genidm.paper.protocol import METHOD
 from genidm.report import drawing
 from genidm.report.drawing import Array, Style, Target, styles
-from genidm.report.paper import METHOD
 from genidm.report.rows import Row
 
 Panel = tuple[str, Mapping[str, Sequence[Array]], Array, float]

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from genidm.evaluation.waypoints import Journeys
 from genidm.report import drawing
 from genidm.report.drawing import Style, Target, styles
-from genidm.waypoints import Journeys
 
 ARROW = 0.6  # metres; the length of an arrow that shows where the body points
 EVERY = 1.0  # seconds from one arrow to the next

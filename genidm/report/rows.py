@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from genidm import stats
-from genidm.episodes import Episodes
-from genidm.report.paper import METHOD
+from genidm.evaluation import stats
+from genidm.evaluation.episodes import Episodes
+from genidm.paper.protocol import METHOD
+from genidm.provenance import code_digest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Row:
         first is `episodes`. A seed is of all that is learned: the experience, 𝒢, the fit.
         Empty where it is not known.
       invariance: mean change of the action when robot and goal are turned alike
-        (`genidm.invariance`); None where it was not measured.
+        (`genidm.evaluation.invariance`); None where it was not measured.
     """
 
     method: str
@@ -39,6 +40,7 @@ class Row:
     settings: dict[str, Any]
     collecting_seeds: Mapping[int, Episodes] = dataclasses.field(default_factory=dict)
     invariance: float | None = None
+    made: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
 
 def results(
@@ -47,7 +49,6 @@ def results(
     robot: str,
     scale: str,
     scenarios: str,
-    environment: Mapping[str, Any],
     engine: Any = None,
 ) -> dict[str, Any]:
     """The rows as one JSON document, methods in the order given; distances in metres.
@@ -58,15 +59,15 @@ def results(
       robot: its name, as in Table 1.
       scale: "quick", "paper" or a number of interactions.
       scenarios: sha256 of the scenario bank.
-      environment: "versions" (package → version) and "hardware" (a sentence).
       engine: what stepped the robot; None if it steps itself.
 
     Returns:
-      robot, engine, scale, scenarios, versions, hardware; methods: name → `stats.summary` with
-      interactions, replayed, settings, and where they are known the training_seed of all of
-      these, the invariance and, of several training seeds, collecting_seeds: the seeds, the
-      episodes of each and `stats.spread`; paired: "LR-GE" → `stats.paired` of LR against
-      GE with, of several training seeds that both have, their `stats.paired_spread`.
+      robot, engine, scale, scenarios; methods: name → `stats.summary` with interactions,
+      replayed, settings, what `made` each stage, and where they are known the training_seed of
+      all of these, the invariance and, of several training seeds, collecting_seeds: the seeds,
+      the episodes of each and `stats.spread`; paired: "LR-GE" → `stats.paired` of LR against
+      GE with, of several training seeds that both have, their `stats.paired_spread`; other_code:
+      module → digest of its code → methods, of modules that the rows have in several versions.
       A number that does not exist is null.
 
     Raises:
@@ -80,9 +81,8 @@ def results(
         "engine": engine and str(engine),
         "scale": scale,
         "scenarios": scenarios,
-        "versions": jsonable(environment["versions"]),
-        "hardware": environment["hardware"],
         "methods": {row.method: _method(row) for row in rows},
+        "other_code": _other_code(rows),
         "paired": {f"{a.method}-{b.method}": _pair(a, b) for a, b in _compared(rows)},
     }
 
@@ -103,7 +103,42 @@ def _method(row: Row) -> dict[str, Any]:
         record["collecting_seeds"] = {"seeds": list(runs), "episodes": sizes, **spread}
     if row.invariance is not None:
         record["invariance"] = float(f"{row.invariance:.3g}")
+    if row.made:
+        made = {name: {**o, "code": code_digest(o["code"])} for name, o in row.made.items()}
+        record["made"] = jsonable(made)
     return record
+
+
+def origin(code: Mapping[str, str], sessions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What made a stage; a table's JSON keeps it with the digest of its code.
+
+    Args:
+      code: of the stage (`Stage.code`).
+      sessions: which commands worked on it (`Stage.made`), at least one.
+
+    Returns:
+      code; commit, clean, versions, hardware and command of the command that
+      finished it; commands: how many worked on it; seconds: of all that were not killed.
+    """
+    last = sessions[-1]
+    names = ("commit", "clean", "versions", "hardware", "command")
+    return {
+        "code": dict(code),
+        **{name: last.get(name) for name in names},
+        "commands": len(sessions),
+        "seconds": sum(session.get("seconds") or 0.0 for session in sessions),
+    }
+
+
+def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
+    """Modules that the rows' stages have in several versions: digest → methods."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        for module, digest in itertools.chain(*(o["code"].items() for o in row.made.values())):
+            methods = found.setdefault(module, {}).setdefault(digest, [])
+            if row.method not in methods:
+                methods.append(row.method)
+    return {module: digests for module, digests in found.items() if len(digests) > 1}
 
 
 def _compared(rows: Sequence[Row]) -> Iterator[tuple[Row, Row]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,14 @@ import numpy as np
 
 from genidm import files
 from genidm.config import plain
-from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.evaluate import Test
-from genidm.methods import ORDER
-from genidm.report.rows import Row
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.evaluate import Test
+from genidm.evaluation.scenarios import Scenarios
+from genidm.paper.methods import ORDER
+from genidm.report.rows import Row, origin
 from genidm.robots import Robot
-from genidm.scenarios import Scenarios
-from genidm.store import Stage
+from genidm.store import DONE, MADE, Stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,14 @@ class Tested:
         """Positions `[steps + 1, 3]` in the episodes of the tours (Fig. 8), metres."""
         ways = self._tree.get("ways", {})
         return [ways[str(i)] for i in range(len(ways))]
+
+    @property
+    def made(self) -> dict[str, dict[str, Any]]:
+        """Stage → what made it, the test last; stages that are no longer there are left out."""
+        root = self.directory.parent
+        stages = [Stage(root / name) for name in self.summary.get("stages", [])]
+        there = [s for s in (*stages, Stage(self.directory)) if s.path(MADE).exists()]
+        return {stage.directory.name: origin(stage.code, stage.made) for stage in there}
 
     @property
     def controller(self) -> Path:
@@ -84,6 +92,7 @@ class Runs:
             settings=tests[0].summary["settings"],
             collecting_seeds={test.summary["seed"]: test.episodes for test in tests},
             invariance=invariance,
+            made=tests[0].made,
         )
 
     @property
@@ -103,11 +112,19 @@ class Runs:
         return None
 
 
-def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) -> Runs:
+def find(
+    robot: Robot,
+    root: Path,
+    bank: Scenarios,
+    scale: str,
+    settings: Test,
+    own: Sequence[Path] = (),
+) -> Runs:
     """The tests of every method that was tested on `bank`.
 
     A method's row is its newest test with the lowest training seed; its newest tests with
-    the other seeds, on whatever part of the bank, give the spread.
+    the other seeds, on whatever part of the bank, give the spread. Tests in `own` count as the
+    newest.
 
     Args:
       robot: whose they are.
@@ -115,15 +132,19 @@ def find(robot: Robot, root: Path, bank: Scenarios, scale: str, settings: Test) 
       bank: the scenarios of the table.
       scale: the scale that the methods were run at.
       settings: of the test.
+      own: directories of the tests that the caller asked for.
     """
-    return Runs(
-        robot, root, bank, _by_method(_finished(robot, root, scale, settings), bank.digest())
-    )
+    done = _finished(robot, root, scale, settings, own)
+    return Runs(robot, root, bank, _by_method(done, bank.digest()))
 
 
-def _finished(robot: Robot, root: Path, scale: str, settings: Test) -> Iterator[Tested]:
+def _finished(
+    robot: Robot, root: Path, scale: str, settings: Test, own: Sequence[Path]
+) -> Iterator[Tested]:
     """All finished tests at a scale, on the robot's engine, oldest first."""
-    done = sorted(root.glob("test-*/done.json"), key=lambda path: path.stat().st_mtime)
+    done = sorted(
+        root.glob(f"test-*/{DONE}"), key=lambda path: (path.parent in own, path.stat().st_mtime)
+    )
     asked = (scale, plain(settings), robot.engine_name)
     for path in done:
         try:

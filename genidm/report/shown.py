@@ -9,13 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from genidm import controller, experience, files, stats, symmetry
-from genidm.invariance import ANGLES, invariance, probes
+from genidm import controller, experience, files, symmetry
+from genidm.evaluation import stats
+from genidm.evaluation.invariance import ANGLES, invariance, probes
+from genidm.evaluation.scenarios import TOUR, UNSEEN_YAW, Scenarios, tours
 from genidm.progress import METRICS, read_metrics
 from genidm.report.figures import Panel
 from genidm.report.runs import Runs
 from genidm.robots import Robot
-from genidm.scenarios import TOUR, UNSEEN_YAW, Scenarios, tours
 
 Curves = dict[str, list[dict[str, Any]]]
 
@@ -32,7 +33,7 @@ class Shown:
       collecting: agent → metrics while it collected.
       learning: method → metrics while its agent learned to go to goals.
       fitting: method → metrics of its fit.
-      residuals: mode of 𝒢 → its residual (`genidm.generalize.residual`).
+      residuals: mode of 𝒢 → its residual (`genidm.paper.generalize.residual`).
       changes: method → change of its actions `[angles, states]` at `ANGLES`; empty where no
         record lies to draw states from.
     """

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from genidm import stats
-from genidm.report.paper import TABLE1
+from genidm.evaluation import stats
+from genidm.paper.protocol import TABLE1
 
 HEADER = (
     *("method", "mean ± std", "95 % interval", "IQM", "≤0.25 m", "≤0.5 m", "≤1 m"),
@@ -105,10 +105,45 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
             "Mean change of the action when robot and goal are turned alike by up to 180° "
             f"(Def. 3): {', '.join(turned)}."
         )
+    notes += _origins(methods)
+    for module, digests in results.get("other_code", {}).items():
+        versions = ", ".join(f"{code} in {' '.join(rows)}" for code, rows in digests.items())
+        notes.append(f"The rows were made by different code: {module} is {versions}.")
     lost = [f"{name} {100 * m['diverged']:.2f} %" for name, m in methods.items() if m["diverged"]]
     if lost:
         notes.append(f"Diverged, and so in no mean: {', '.join(lost)}.")
     return notes
+
+
+def _origins(methods: Mapping[str, Any]) -> Iterator[str]:
+    """Which commit, versions and machine made the rows."""
+    made = {name: m["made"] for name, m in methods.items() if m.get("made")}
+    for what, name in (("Commit", "commit"), ("Versions", "versions"), ("Hardware", "hardware")):
+        of_rows = {row: _values(stages, name) for row, stages in made.items()}
+        yield from _by_value(what, of_rows)
+
+
+def _values(stages: Mapping[str, Any], name: str) -> str:
+    """What the stages of a row have under a name, each value once."""
+    found = []
+    for origin in stages.values():
+        value = origin[name]
+        if name == "commit":
+            value = (value or "no repository")[:10] + ("" if origin["clean"] else " (changed)")
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{package} {v}" for package, v in value.items() if v)
+        found.append(value)
+    return "; ".join(dict.fromkeys(found))
+
+
+def _by_value(what: str, of_rows: Mapping[str, str]) -> Iterator[str]:
+    """One sentence where all rows agree, else one that names the rows."""
+    values = dict.fromkeys(of_rows.values())
+    if len(values) == 1:
+        yield f"{what}: {next(iter(values))}."
+    elif values:
+        rows = {v: [row for row, x in of_rows.items() if x == v] for v in values}
+        yield f"{what}: " + ". ".join(f"{', '.join(r)}: {v}" for v, r in rows.items()) + "."
 
 
 def _one_seed(methods: Mapping[str, Any]) -> str:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from genidm import files
-from genidm.config import environment
 from genidm.errors import BadInput
-from genidm.evaluate import Test
-from genidm.invariance import ANGLES
+from genidm.evaluation.evaluate import Test
+from genidm.evaluation.invariance import ANGLES
+from genidm.evaluation.scenarios import Scenarios
+from genidm.paper.protocol import TABLE1
 from genidm.report import figures, table
-from genidm.report.paper import TABLE1
 from genidm.report.rows import Row, results
 from genidm.report.runs import Runs, find
 from genidm.report.shown import Shown, gather
 from genidm.robots import Robot
-from genidm.scenarios import Scenarios
+from genidm.store import alone
 
 
 def report(
@@ -26,6 +27,7 @@ def report(
     scale: str,
     settings: Test,
     results: Path | None = None,
+    own: Sequence[Path] = (),
 ) -> Path:
     """Writes the table and the figures of all methods that were tested on `bank`.
 
@@ -35,7 +37,10 @@ def report(
       bank: the scenarios of the table.
       scale: the scale that the methods were run at.
       settings: of the test.
-      results: also write `ROBOT.json` and the figures there.
+      results: also write the table, its numbers and the figures there, under names that begin
+        with the robot's, the engine's where it has several, and the scale's but for "paper".
+      own: directories of the tests that the caller asked for; they are rows, also where there
+        are newer tests of methods with the same names.
 
     Returns:
       the directory of the report.
@@ -43,24 +48,25 @@ def report(
     Raises:
       BadInput: no method was tested on the bank.
     """
-    runs = find(robot, root, bank, scale, settings)
+    runs = find(robot, root, bank, scale, settings, own)
     if not runs.found:
         raise BadInput(f"no method in {root} has been tested on these scenarios")
     shown = gather(runs)
     rows = [runs.row(name, shown.invariance(name)) for name in runs.found]
     written = _document(runs, rows, scale)
-    engine = f"-{robot.engine_name}" if len(robot.engines) > 1 else ""
-    here = root / f"report-{scale}{engine}"
+    engine = [robot.engine_name] if robot.engine_name and len(robot.engines) > 1 else []
+    here = root / "-".join(["report", scale, *engine])
     _write(here, "", "results.json", written, rows, shown)
     if results:
-        _write(results, f"{robot.name}_", f"{robot.name}.json", written, rows, shown)
+        name = "_".join([robot.name, *engine, *([scale] if scale != "paper" else [])])
+        _write(results, f"{name}_", f"{name}.json", written, rows, shown)
     return here
 
 
 def _document(runs: Runs, rows: list[Row], scale: str) -> dict[str, Any]:
     return results(
         rows, robot=runs.robot.name, engine=runs.robot.engine, scale=scale,
-        scenarios=runs.bank.digest(), environment=environment(),
+        scenarios=runs.bank.digest(),
     )  # fmt: skip
 
 
@@ -68,6 +74,15 @@ def _write(
     directory: Path, prefix: str, name: str, written: dict[str, Any], rows: list[Row], shown: Shown
 ) -> None:
     """The table as JSON under `name`, as Markdown and text, and the figures."""
+    with files.disk(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+    with alone(directory):  # another command may write the same report
+        _write_alone(directory, prefix, name, written, rows, shown)
+
+
+def _write_alone(
+    directory: Path, prefix: str, name: str, written: dict[str, Any], rows: list[Row], shown: Shown
+) -> None:
     files.save_json(directory / name, written)
     files.save_text(directory / f"{prefix}table.md", table.markdown(written))
     drawn = _draw(directory, prefix, rows, shown, TABLE1.get(written["robot"]))
@@ -82,7 +97,7 @@ def _draw(
     prefix: str,
     rows: list[Row],
     shown: Shown,
-    paper: dict[str, tuple[float, float]] | None,
+    paper: Mapping[str, tuple[float, float]] | None,
 ) -> list[str]:
     """Draws what there is data for; the names of the files, in alphabetical order."""
     drawn = []

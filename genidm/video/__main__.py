@@ -9,9 +9,9 @@ import tyro
 
 from genidm import video
 from genidm.errors import BadInput
-from genidm.experiment import guarded
+from genidm.evaluation.waypoints import Follow, in_twos
+from genidm.runs.command import guarded
 from genidm.video.filming import LONGEST
-from genidm.waypoints import Follow, in_twos
 
 
 def main(

@@ -14,12 +14,12 @@ import numpy as np
 
 from genidm import controller
 from genidm.errors import BadInput
-from genidm.evaluate import Steering, Test
+from genidm.evaluation.evaluate import Steering, Test
+from genidm.evaluation.scenarios import scenarios
+from genidm.evaluation.waypoints import Follow, Journeys, follow
 from genidm.files import Torn, load_arrays, load_json
 from genidm.robots import Robot, State, by_name, remade
-from genidm.scenarios import scenarios
 from genidm.store import Stage
-from genidm.waypoints import Follow, Journeys, follow
 
 # Robots that walk at once, filled up with some of them again: a program is then compiled once
 # for films of however many, and float sums, which depend on that number, come out alike.

@@ -22,9 +22,9 @@ from genidm.checks import check, count, optional
 from genidm.engines import Engine
 from genidm.errors import BadInput
 from genidm.experience import Experience
-from genidm.pairs import Pairs, pairs
+from genidm.paper.pairs import Pairs, pairs
+from genidm.paper.replaying import Blocks, Replay, Runner
 from genidm.progress import Progress
-from genidm.replaying import Blocks, Replay, Runner
 from genidm.robots.base import Robot
 
 Mode = Literal["segments", "episodes", "rotate"]

@@ -1,4 +1,4 @@
-"""Fitting IDM and LFM/IDM: the losses of Eq. 5–7 and one jitted loop for every method."""
+"""Fitting IDM and LFM/IDM (A.1.2): one jitted loop for every method, over the losses of `idm`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from genidm import devices
 from genidm.checks import check, count, layers, number, optional, positive
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
-from genidm.models import Architecture
-from genidm.pairs import Pairs
+from genidm.paper import protocol
+from genidm.paper.idm import Architecture, loss_plain, loss_siamese
+from genidm.paper.pairs import Pairs
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot
 from genidm.store import Stage
@@ -45,13 +46,13 @@ class Fit:
     """
 
     updates: int = 20_000
-    batch: int = 512
-    learning_rate: float = 1e-3
+    batch: int = protocol.BATCH_SIZE
+    learning_rate: float = protocol.LEARNING_RATE
     decay: bool = True
     idm: tuple[int, ...] = (256, 256)
     lfm: tuple[int, ...] = (256, 256)
     latent_size: int | None = None
-    latent_weight: float = 0.25
+    latent_weight: float = protocol.LATENT_WEIGHT
     averaged: bool = True
 
     def __post_init__(self) -> None:
@@ -66,35 +67,6 @@ class Fit:
         """Adam, with the schedule."""
         rate = self.learning_rate
         return optax.adam(optax.cosine_decay_schedule(rate, self.updates) if self.decay else rate)
-
-
-def loss_latent(latent: jax.Array, latent_hat: jax.Array) -> jax.Array:
-    """L1 (Eq. 5): squared distance of the latents `[..., k]` of e.m.o. samples, batch mean."""
-    return jnp.mean(jnp.sum((latent - latent_hat) ** 2, axis=-1))
-
-
-def loss_action(predicted: jax.Array, action: jax.Array) -> jax.Array:
-    """L2 (Eq. 6): squared distance of actions `[..., A]`, batch mean."""
-    return jnp.mean(jnp.sum((predicted - action) ** 2, axis=-1))
-
-
-def loss_plain(model: Controller, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L2 of an IDM on samples of one view each; what RS, RL and GE minimise."""
-    action = loss_action(model.raw(batch.s[0], batch.d[0]), batch.a)
-    return action, {"loss": action, "loss_action": action}
-
-
-def loss_siamese(
-    model: Controller, batch: Pairs, latent_weight: float, averaged: bool
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees their mean latent, or each."""
-    latents = model.latent(batch.s, batch.d)
-    latent = loss_latent(latents[0], latents[1])
-    seen = latents.mean(0, keepdims=True) if averaged else latents
-    predicted = model.architecture.action(model.params, seen)
-    action = loss_action(predicted, jnp.broadcast_to(batch.a, predicted.shape))
-    loss = latent_weight * latent + (1 - latent_weight) * action
-    return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}
 
 
 def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:

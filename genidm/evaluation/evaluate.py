@@ -11,11 +11,11 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.episodes import Episodes
-from genidm.evaluator import Evaluator, Outcome, Steering, Test, Watch, position
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.evaluator import Evaluator, Outcome, Steering, Test, Watch, position
+from genidm.evaluation.scenarios import Scenarios
 from genidm.progress import Progress
 from genidm.robots.base import Robot
-from genidm.scenarios import Scenarios
 from genidm.store import Stage
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import symmetry
-from genidm.evaluate import Steering
+from genidm.evaluation.evaluate import Steering
 from genidm.experience import Experience
 from genidm.robots.base import Robot
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from genidm.episodes import Episodes
+from genidm.evaluation.episodes import Episodes
 
 Array = np.ndarray
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -21,28 +22,31 @@ import numpy as np
 
 from genidm import controller, experience, files
 from genidm.agents.base import Agent
+from genidm.agents.collect import collect, whole
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.policy import Policy
-from genidm.collect import collect, whole
 from genidm.config import plain
-from genidm.episodes import Episodes
 from genidm.errors import BadInput
-from genidm.evaluate import Steering, Test, episodes, flatten, run
+from genidm.evaluation.episodes import Episodes
+from genidm.evaluation.evaluate import Steering, Test, episodes, flatten, run
+from genidm.evaluation.scenarios import Scenarios, tours
 from genidm.experience import Experience
-from genidm.fit import fit
-from genidm.generalize import replay, residual
-from genidm.methods import Direct, Inverse, Method
-from genidm.pairs import pairs
-from genidm.replaying import Replay
+from genidm.paper.fit import fit
+from genidm.paper.generalize import replay, residual
+from genidm.paper.methods import Direct, Inverse, Method
+from genidm.paper.pairs import pairs
+from genidm.paper.replaying import Replay
+from genidm.provenance import code_of
 from genidm.robots import Robot, State
-from genidm.scale import Scale
-from genidm.scenarios import Scenarios, tours
+from genidm.runs.scale import Scale
 from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
 
 # Episodes of the test that can be filmed as they went.
 FILMED = 3
+# What makes a record, beside the agent.
+COLLECT = "genidm.agents.collect"
 
 
 class Trace(NamedTuple):
@@ -68,6 +72,8 @@ class Cell(abc.ABC, Generic[M]):
       seed: of all that is learned; the test's are fixed.
       root: directory of the stages.
       test: settings of the test.
+      notes: who set what (`resolve.who_set_what`); said when work begins, and stored.
+      other_code: finished stages that other code made are used.
     """
 
     robot: Robot
@@ -76,6 +82,8 @@ class Cell(abc.ABC, Generic[M]):
     seed: int
     root: Path
     test: Test
+    notes: tuple[str, ...] = ()
+    other_code: bool = False
 
     @property
     @abc.abstractmethod
@@ -87,6 +95,27 @@ class Cell(abc.ABC, Generic[M]):
         """What steers the robot in the test; made, unless it is there."""
 
     @property
+    def config(self) -> dict[str, Any]:
+        """All that the run is made with, as JSON holds it; the names of its stages follow from it.
+
+        Returns:
+          robot, method, scale, seed, test; notes, which say who set what.
+        """
+        names = ("method", "scale", "seed", "test", "notes")
+        return {"robot": self.robot.settings} | {name: getattr(self, name) for name in names}
+
+    @property
+    @abc.abstractmethod
+    def sources(self) -> list[Stage]:
+        """The stages that the controller comes from, its own the last."""
+
+    def _stage(self, name: str, config: dict[str, Any], *code: Any) -> Stage:
+        """The stage of a config, made by this module, the robot's, its engine's and `code`."""
+        made_by = code_of(__name__, self.robot, self.robot.engine, config, *code)
+        config = {"robot": self.robot.settings, "seed": self.seed} | config
+        return Stage.open(self.root, name, config, made_by, self.other_code)
+
+    @property
     def _label(self) -> str:
         return f"{self.method.name.replace(' ', '-')}-{self.seed}"
 
@@ -95,10 +124,7 @@ class Cell(abc.ABC, Generic[M]):
 
     def _learning(self, agent: Any, interactions: int) -> dict[str, Any]:
         """The config of a stage in which an agent is at work."""
-        return dict(
-            robot=self.robot.settings, agent=agent, task=self.method.task,
-            interactions=interactions, seed=self.seed,
-        )  # fmt: skip
+        return {"agent": agent, "task": self.method.task, "interactions": interactions}
 
     def _collect(
         self, stage: Stage, agent: Agent, interactions: int, keep: bool = True
@@ -118,11 +144,13 @@ class Cell(abc.ABC, Generic[M]):
           kind: first word of the stage's name. The report shows all of kind "test"; those
             of another kind are no rows of its table.
         """
-        config = dict(
-            robot=self.robot.settings, fit=self.controller_stage.directory.name,
-            bank=bank.digest(), test=self.test,
-        )  # fmt: skip
-        stage = Stage.open(self.root, f"{kind}-{self._label}", config)
+        source = self.controller_stage.directory.name
+        config = {"fit": source, "bank": bank.digest(), "test": self.test}
+        code = ("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.controller")
+        stage = self._stage(f"{kind}-{self._label}", config, *code)
+        if not stage.done:
+            for note in self.notes:
+                print(note, file=sys.stderr)
         stage.once(lambda: self._tested(stage, bank))
         return stage
 
@@ -142,6 +170,7 @@ class Cell(abc.ABC, Generic[M]):
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
             | {"engine": self.robot.engine_name}
             | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
+            | {"stages": [source.directory.name for source in self.sources], "run": self.config}
         )
 
     def _recordings(self, traces: list[Trace], target: np.ndarray) -> list[dict[str, np.ndarray]]:
@@ -171,7 +200,7 @@ class InverseCell(Cell[Inverse]):
         """Where the record lies; shared by all methods with the same agent."""
         agent = self.method.agent
         config = self._learning(agent, self.scale.interactions)
-        return Stage.open(self.root, f"experience-{type(agent).__name__}-{self.seed}", config)
+        return self._stage(f"experience-{type(agent).__name__}-{self.seed}", config, COLLECT)
 
     def experience(self) -> Experience:
         """What the agent saw while it learned (§4.1)."""
@@ -188,14 +217,26 @@ class InverseCell(Cell[Inverse]):
         recorded = record.interactions
         return {"interactions": before + recorded, "recorded": recorded}
 
-    def _collector(self) -> tuple[Agent, int]:
-        """What collects, and for how many interactions it has learned before."""
+    @functools.cached_property
+    def agent_stage(self) -> Stage | None:
+        """Where the policy lies that collects once it is frozen; None for other agents."""
         frozen = self.method.agent
         if not isinstance(frozen, Frozen):
+            return None
+        config = self._learning(frozen.agent, self._before(frozen))
+        return self._stage(f"agent-{type(frozen.agent).__name__}-{self.seed}", config, COLLECT)
+
+    def _before(self, frozen: Frozen) -> int:
+        """Interactions after which an agent is frozen."""
+        return whole(frozen.agent, round(frozen.share * self.scale.interactions))
+
+    def _collector(self) -> tuple[Agent, int]:
+        """What collects, and for how many interactions it has learned before."""
+        frozen, stage = self.method.agent, self.agent_stage
+        if not isinstance(frozen, Frozen):
             return frozen, 0
-        interactions = whole(frozen.agent, round(frozen.share * self.scale.interactions))
-        config = self._learning(frozen.agent, interactions)
-        stage = Stage.open(self.root, f"agent-{type(frozen.agent).__name__}-{self.seed}", config)
+        assert stage
+        interactions = self._before(frozen)
 
         def work() -> dict[str, Any]:
             _, policy = self._collect(stage, frozen.agent, interactions, keep=False)
@@ -214,10 +255,10 @@ class InverseCell(Cell[Inverse]):
         m = self.method
         if m.generalize is None:
             return None
-        config = dict(
-            experience=self.experience_stage.directory.name, share=m.share, generalize=m.generalize
-        )
-        return Stage.open(self.root, f"replay-{m.generalize.mode}-{self.seed}", config)
+        source = self.experience_stage.directory.name
+        config = {"experience": source, "share": m.share, "generalize": m.generalize}
+        name = f"replay-{m.generalize.mode}-{self.seed}"
+        return self._stage(name, config, "genidm.paper.generalize")
 
     def replay(self, record: Experience) -> Replay | None:
         """𝒢(E) (Def. 4) of the part of the record that the method learns from."""
@@ -237,14 +278,19 @@ class InverseCell(Cell[Inverse]):
     @functools.cached_property
     def controller_stage(self) -> Stage:
         """Where the controller lies."""
-        m = self.method
         source = self.replay_stage or self.experience_stage
-        config = dict(
-            source=source.directory.name, share=m.share, look_ahead=m.look_ahead,
-            mirror=m.mirror, frame=m.frame, fit=m.fit,
-        )  # fmt: skip
+        # All that a method says but what its source is made with: a field that is new counts.
+        config = {f.name: getattr(self.method, f.name) for f in dataclasses.fields(self.method)}
+        for upstream in dataclasses.fields(Method):
+            del config[upstream.name]
         again = {"repeat": self.repeat} if self.repeat else {}
-        return Stage.open(self.root, self._label, config | again)
+        config = {"source": source.directory.name} | config | again
+        return self._stage(self._label, config, "genidm.paper.fit", "genidm.paper.pairs")
+
+    @property
+    def sources(self) -> list[Stage]:
+        stages = (self.agent_stage, self.experience_stage, self.replay_stage, self.controller_stage)
+        return [stage for stage in stages if stage]
 
     @property
     def _fit_key(self) -> jax.Array:
@@ -286,7 +332,11 @@ class DirectCell(Cell[Direct]):
     @functools.cached_property
     def controller_stage(self) -> Stage:
         config = self._learning(self.method.agent, self.scale.interactions)
-        return Stage.open(self.root, self._label, config)
+        return self._stage(self._label, config, COLLECT)
+
+    @property
+    def sources(self) -> list[Stage]:
+        return [self.controller_stage]
 
     def controller(self) -> Steering:
         """The policy that the agent ended with."""

@@ -14,7 +14,7 @@ import numpy as np
 from genidm import symmetry
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
-from genidm.replaying import Replay
+from genidm.paper.replaying import Replay
 from genidm.robots.base import Robot
 
 # Share of a record that is too little to be learned from without a word.

@@ -19,10 +19,10 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.checks import check, count, number
+from genidm.evaluation.scenarios import Scenarios
 from genidm.progress import compiled
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
-from genidm.scenarios import Scenarios
 from genidm.symmetry import horizontal
 
 # (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled

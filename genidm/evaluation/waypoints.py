@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from genidm import devices
 from genidm.checks import check, count, positive
 from genidm.errors import BadInput
-from genidm.evaluate import Steering
+from genidm.evaluation.evaluate import Steering
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout

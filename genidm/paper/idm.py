@@ -1,13 +1,18 @@
-"""The two models (Eq. 1, 3, 4): the latent feature model ψ and the inverse dynamics model φ."""
+"""The two models and what they minimise: Def. 2, Def. 5, Eq. 1 and Eq. 3–7.
+
+φ is the inverse dynamics model (IDM), ψ the latent feature model (LFM).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+
+from genidm.paper.pairs import Pairs
 
 
 class MLP(nn.Module):
@@ -81,3 +86,42 @@ class Architecture:
     def action(self, params: dict, latent: jax.Array) -> jax.Array:
         """φ(γ) = a `[..., A]` (Eq. 4, or Eq. 1 without an LFM)."""
         return _apply(self._idm(), params["idm"], latent)
+
+
+class Model(Protocol):
+    """ψ and φ with their parameters, as the losses ask for them."""
+
+    def latent(self, s: jax.Array, d: jax.Array) -> jax.Array:
+        """γ = ψ(s, d) `[..., k]` (Eq. 3); without an LFM (s, d) itself."""
+
+    def action(self, latent: jax.Array) -> jax.Array:
+        """φ(γ) `[..., A]` (Eq. 4; Eq. 1 without an LFM)."""
+
+
+def loss_latent(latent: jax.Array, latent_hat: jax.Array) -> jax.Array:
+    """L1 (Eq. 5): squared distance of the latents `[..., k]` of e.m.o. samples, batch mean."""
+    return jnp.mean(jnp.sum((latent - latent_hat) ** 2, axis=-1))
+
+
+def loss_action(predicted: jax.Array, action: jax.Array) -> jax.Array:
+    """L2 (Eq. 6): squared distance of actions `[..., A]`, batch mean."""
+    return jnp.mean(jnp.sum((predicted - action) ** 2, axis=-1))
+
+
+def loss_plain(model: Model, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L2 of an IDM on samples of one view each; what RS, RL and GE minimise."""
+    action = loss_action(model.action(model.latent(batch.s[0], batch.d[0])), batch.a)
+    return action, {"loss": action, "loss_action": action}
+
+
+def loss_siamese(
+    model: Model, batch: Pairs, latent_weight: float, averaged: bool
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees their mean latent, or each."""
+    latents = model.latent(batch.s, batch.d)
+    latent = loss_latent(latents[0], latents[1])
+    seen = latents.mean(0, keepdims=True) if averaged else latents
+    predicted = model.action(seen)
+    action = loss_action(predicted, jnp.broadcast_to(batch.a, predicted.shape))
+    loss = latent_weight * latent + (1 - latent_weight) * action
+    return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}

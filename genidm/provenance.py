@@ -1,0 +1,204 @@
+"""What made a result: the code it depends on, the commit, versions, machine and command.
+
+A stage depends on code through `code_of`: the modules of genidm that its settings, its robot,
+its engine and its own function import, one through another. A module counts by its syntax tree
+without docstrings and comments, so that an edit of prose changes nothing. Not counted are
+
+- `UNRELATED`: modules that show, check, name or store results, and do not make them;
+- packages' `__init__`, which list what is there: a new robot does not change the Ant's results.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+PACKAGES = (
+    *("genidm", "numpy", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint"),
+    *("brax", "mujoco", "mujoco-mjx", "pybullet"),
+)
+UNRELATED = frozenset(
+    f"genidm.{name}"
+    for name in (
+        *("checkpoints", "checks", "config", "errors", "files", "progress", "provenance"),
+        *("quiet", "store"),
+    )
+)
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def code_of(*roots: Any) -> dict[str, str]:
+    """The modules that a result depends on: name → ten hex digits of its code.
+
+    Args:
+      roots: names of modules, or objects: of these the modules that define their classes count,
+        and those of all dataclasses inside them.
+    """
+    found: dict[str, str] = {}
+    todo = {name for root in roots for name in _modules_of(root)}
+    while todo:
+        name = todo.pop()
+        tree = None if name in UNRELATED or name in found else _tree(name)
+        if tree is not None:
+            found[name] = _digest(name)
+            todo |= set(_imported(name))
+    return dict(sorted(found.items()))
+
+
+def code_digest(code: Mapping[str, str]) -> str:
+    """Ten hex digits that stand for all modules of `code_of`."""
+    text = "\n".join(f"{name} {digest}" for name, digest in sorted(code.items()))
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+    """Modules that two results do not have in common, or have in two versions."""
+    return sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
+
+
+def _modules_of(root: Any) -> Iterator[str]:
+    if isinstance(root, str):
+        yield root
+    elif isinstance(root, Mapping):
+        yield from (name for x in root.values() for name in _modules_of(x))
+    elif isinstance(root, tuple | list):
+        yield from (name for x in root for name in _modules_of(x))
+    elif dataclasses.is_dataclass(root):
+        yield from _defined_in(type(root))
+        for field in dataclasses.fields(root):
+            value = getattr(root, field.name)
+            if not isinstance(value, str):  # a word, and no module
+                yield from _modules_of(value)
+    elif not isinstance(root, bool | int | float | None):
+        yield from _defined_in(type(root))
+
+
+def _defined_in(kind: type) -> Iterator[str]:
+    """The modules of a class and of those that it inherits from."""
+    yield from (base.__module__ for base in kind.__mro__)
+
+
+@functools.cache
+def _tree(name: str) -> ast.Module | None:
+    """The syntax tree of a module; None of what is no module of ours or the user's."""
+    path = _path(name)
+    return ast.parse(path.read_text(encoding="utf-8")) if path else None
+
+
+def _path(name: str) -> Path | None:
+    """The file of a module; None of packages, of what Python or others bring, and of notebooks."""
+    module = sys.modules.get(name)
+    file = getattr(module, "__file__", None)
+    if module is None and (name == "genidm" or name.startswith("genidm.")):
+        parts = name.split(".")[1:]
+        file = str(_PACKAGE.joinpath(*parts).with_suffix(".py"))
+    path = Path(file) if file else None
+    ours = path is not None and path.suffix == ".py" and path.name != "__init__.py"
+    if path is None or not ours or "site-packages" in path.parts or not path.exists():
+        return None
+    return None if Path(os.__file__).parent in path.parents else path
+
+
+@functools.cache
+def _digest(name: str) -> str:
+    tree = _tree(name)
+    assert tree
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [x for x in body if not _is_text(x)]  # type: ignore[attr-defined]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:10]
+
+
+def _is_text(node: ast.AST) -> bool:
+    """Whether a statement is a docstring, of whatever."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+@functools.cache
+def _imported(name: str) -> tuple[str, ...]:
+    """The modules of genidm that a module imports."""
+    tree, found = _tree(name), list[str]()
+    assert tree
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(n for n in found if n.startswith("genidm.") and _path(n))
+
+
+@functools.cache
+def environment() -> dict[str, Any]:
+    """Where a result is made.
+
+    Returns:
+      `versions` of packages (None where absent), `hardware` in a line, git `commit` (None
+      outside of a clone) and whether the tree was `clean`.
+    """
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    devices = f"{jax.device_count()} jax devices ({jax.devices()[0].device_kind})"
+    commit, clean = _commit()
+    return {
+        "versions": versions,
+        "hardware": f"{_machine()}, {devices}",
+        "commit": commit,
+        "clean": clean,
+    }
+
+
+def command() -> str:
+    """The command line of this process, as it can be given again."""
+    name = getattr(getattr(sys.modules["__main__"], "__spec__", None), "name", None)
+    program = ["python", "-m", name.removesuffix(".__main__")] if name else sys.argv[:1]
+    return shlex.join([*program, *sys.argv[1:]])
+
+
+def _machine() -> str:
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*:\s*(.+)", info.read_text()) if info.exists() else None
+    model = found[1] if found else platform.processor() or platform.machine()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{model}, {os.cpu_count()} cores, {memory:.0f} GiB"
+
+
+def _commit() -> tuple[str | None, bool | None]:
+    """The commit of the clone that this package lies in, and whether nothing is changed there."""
+    git = ["git", "-C", str(_PACKAGE)]
+    try:
+        top, commit = _lines([*git, "rev-parse", "--show-toplevel", "HEAD"])[:2]
+        # Not the commit of a repository that happens to lie around an installed package.
+        if Path(top) != _PACKAGE.parent:
+            return None, None
+        return commit, not _lines([*git, "status", "--porcelain"])
+    except (OSError, ValueError, subprocess.CalledProcessError):
+        return None, None
+
+
+def _lines(command: Iterable[str]) -> list[str]:
+    out = subprocess.run([*command], capture_output=True, text=True, check=True).stdout
+    return out.splitlines()

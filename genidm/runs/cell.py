@@ -1,0 +1,153 @@
+"""A cell of Table 1: made from a method, run to its row, filmed and reported."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from genidm import controller, devices
+from genidm.errors import BadInput
+from genidm.evaluation.evaluate import Steering
+from genidm.evaluation.scenarios import Scenarios, scenarios
+from genidm.paper.methods import Direct, Inverse
+from genidm.robots import Robot, by_name
+from genidm.runs.resolve import Options, resolve, who_set_what
+from genidm.runs.run import Cell, DirectCell, InverseCell
+from genidm.runs.scale import scale_of
+from genidm.store import Stage
+
+
+def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
+    """The cell of a method as scale and machine have it (`resolve`)."""
+    chosen = resolve(robot, method, options)
+    return cell_of(robot, chosen, options, who_set_what(method, chosen, chosen))
+
+
+def cell_of(
+    robot: Robot, method: Direct | Inverse, options: Options, notes: tuple[str, ...] = ()
+) -> Cell[Any]:
+    """The cell of a method exactly as it is given; `notes` say who set what."""
+    if options.video:
+        robot.drawing()  # what cannot be filmed is said before anything is computed
+    given: dict[str, Any] = dict(
+        robot=robot, scale=scale_of(options.scale, robot.paper_interactions), seed=options.seed,
+        root=options.out / robot.name, test=options.test,
+        notes=notes, other_code=options.other_code,
+    )  # fmt: skip
+    kind: Any = DirectCell if isinstance(method, Direct) else InverseCell
+    return kind(method=method, **given)
+
+
+def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
+    """Runs the cell of a method, as scale and machine have it, and writes the report.
+
+    Returns:
+      the directory of the report of all cells beside it.
+    """
+    return run_to_the_end(cell(robot, method, options), options)
+
+
+def run_to_the_end(this: Cell[Any], options: Options) -> Path:
+    """Runs a cell and writes the report of all cells beside it: its directory is returned."""
+    announce(this.robot, options.engine)
+    tested = bank_of(this, options)
+    stage = this.episodes(tested)
+    if options.video:
+        film_cell(this)
+    return write_report(this, tested, options, [stage])
+
+
+def saved(
+    runs: Sequence[Path], engine: str | None = None
+) -> tuple[Robot, dict[str, tuple[Steering, dict[str, Any]]]]:
+    """Controllers to be compared, from the directories of their runs.
+
+    Args:
+      runs: the directories.
+      engine: to step their robot with; chosen by what jax runs on, unless given.
+
+    Returns:
+      their robot; and by the method's name, or where two runs have the same also the run's,
+      the controller and what the run says of it.
+
+    Raises:
+      BadInput: there are none, one is no finished run, or they are of different robots.
+    """
+    if not runs:
+        raise BadInput("give the directory of a run: METHOD-SEED-… under --out of a cell")
+    robots: dict[str, Robot] = {}
+    models: dict[str, tuple[Steering, dict[str, Any]]] = {}
+    for run in runs:
+        summary = Stage(run).summary()
+        kind, name = summary["robot"], summary["method"]
+        robots.setdefault(kind, by_name(kind, engine))
+        model = controller.load(run, robots[kind])
+        models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
+    if len(robots) > 1:
+        raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")
+    (robot,) = robots.values()
+    announce(robot, engine)
+    return robot, models
+
+
+def film_cell(this: Cell[Any]) -> None:
+    """Films a cell's test, beside its controller.
+
+    `video.html` and, where a picture can be drawn, `video.gif`.
+    """
+    from genidm import video  # nor is this
+
+    stage = this.controller_stage
+    title = f"{this.method.name}, {this.robot.name}"
+    test = video.recorded(stage.directory, this.robot)
+    made = (
+        video.film_tested(this.robot, test, title=title)
+        if test
+        else video.film_test(this.robot, this.controller(), title=title)
+    )
+    video.write(made, stage.path("video.html"))
+    try:
+        video.write(made, stage.path("video.gif"))
+    except BadInput as error:
+        print(f"no gif: {error}", file=sys.stderr)
+    print(f"Video in {stage.directory}", file=sys.stderr)
+
+
+def bank_of(this: Cell[Any], options: Options) -> Scenarios:
+    """The scenarios that a cell is tested on, as its scale or the user says."""
+    episodes = this.scale.episodes if options.episodes is None else options.episodes
+    return scenarios(this.robot, this.scale.seeds, episodes)
+
+
+def write_report(
+    this: Cell[Any], bank: Scenarios, options: Options, own: Iterable[Stage] = ()
+) -> Path:
+    """The report of all cells that lie beside one, and were tested on `bank`.
+
+    Args:
+      this: a cell of the report.
+      bank: the scenarios of the table.
+      options: scale, test, places.
+      own: tests that this command asked for: they are its rows, also where there are newer
+        tests of methods with the same names.
+
+    Returns:
+      the directory of the report.
+    """
+    from genidm.report.write import report  # drawing is not needed before the end
+
+    return report(
+        this.robot, this.root, bank, this.scale.name, options.test, options.results,
+        own=[stage.directory for stage in own],
+    )  # fmt: skip
+
+
+def announce(robot: Robot, engine: str | None) -> None:
+    """Says on stderr what steps a robot and, if the user named no `engine`, why."""
+    if robot.engine:
+        where = "an accelerator" if devices.accelerated() else "no accelerator"
+        others = " or ".join(name for name in robot.engines if name != robot.engine.name)
+        why = f": jax has {where}; --engine {others} instead" if engine is None and others else ""
+        print(f"{robot.name} on {robot.engine}{why}", file=sys.stderr)

@@ -1,0 +1,111 @@
+"""The command line of a cell, and what ends every command of ours: one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any
+
+import tyro
+
+from genidm import devices
+from genidm.checkpoints import requested_seconds
+from genidm.errors import BadInput
+from genidm.paper.methods import Direct, Inverse
+from genidm.robots import Robot
+from genidm.runs.cell import cell_of, run_to_the_end
+from genidm.runs.resolve import Options, resolve, who_set_what
+
+
+def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
+    """The command line of a cell: `python -m experiments.ant_lr`.
+
+    The flags are read twice. The first time scale and engine; what they choose is what the flags
+    of the method start from the second time.
+    """
+    description = f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end."
+    with in_sentences():
+        if {"-h", "--help"} & set(sys.argv[1:]):
+            _parse(_settings(method), description)
+            return
+        early, _ = _parse(_early, description, return_unknown_args=True)
+        made = robot(**({} if early.engine is None else {"engine": early.engine}))
+        chosen = resolve(made, method, early)
+        options, given = _parse(_settings(chosen), description)
+        this = cell_of(made, given, options, who_set_what(method, chosen, given))
+        report = run_to_the_end(this, options)
+        print((report / "table.txt").read_text(encoding="utf-8"))
+
+
+def _early(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> Options:
+    return options
+
+
+def _settings(method: Direct | Inverse) -> Callable[..., tuple[Options, Direct | Inverse]]:
+    """A function whose parameters are the flags of a cell."""
+
+    def both(
+        options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
+        method: Direct | Inverse = method,
+    ) -> tuple[Options, Direct | Inverse]:
+        return options, method
+
+    return both
+
+
+def guarded(command: Callable[..., None], description: str) -> None:
+    """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr."""
+    with in_sentences():
+        _parse(command, description)
+
+
+def _parse(command: Callable[..., Any], description: str, **how: Any) -> Any:
+    """Calls a function with what the command line says."""
+    return tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,), **how)
+
+
+@contextlib.contextmanager
+def in_sentences() -> Iterator[None]:
+    """Ends the program in one sentence on stderr where its input is bad, or at Ctrl-C.
+
+    The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
+    """
+    warnings.showwarning = _warn
+    inherited = os.environ.get("MPLBACKEND")
+    # Files are written, no window is opened: not even where Jupyter's backend is inherited.
+    os.environ["MPLBACKEND"] = "Agg"
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # "≤" on a terminal that has none
+    try:
+        devices.requested()
+        requested_seconds()
+        yield
+    except BadInput as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except MemoryError as error:
+        print(f"error: not enough memory: {error}", file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:  # what reads the output has ended: `… | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped: the same command goes on where it was", file=sys.stderr)
+        sys.exit(130)
+    finally:
+        os.environ.pop("MPLBACKEND")
+        if inherited is not None:
+            os.environ["MPLBACKEND"] = inherited
+
+
+def _warn(
+    message: Warning | str, category: Any, filename: str, lineno: int, file: Any = None,
+    line: str | None = None,
+) -> None:  # fmt: skip
+    """A warning as a user wants it: what is the matter, not which line of ours said so."""
+    print(f"warning: {message}", file=sys.stderr)

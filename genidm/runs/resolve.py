@@ -1,0 +1,132 @@
+"""One method as it is run: method + scale + machine + what the user sets, and who set what."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from genidm import devices
+from genidm.agents.frozen import Frozen
+from genidm.agents.off_policy import OffPolicy
+from genidm.agents.ppo import PPO
+from genidm.checks import check, count, optional
+from genidm.config import flat, plain
+from genidm.errors import BadInput
+from genidm.evaluation.evaluate import Test
+from genidm.paper.methods import Direct, Inverse, literal
+from genidm.robots import Robot
+from genidm.runs.scale import Scale, scale_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What every cell takes.
+
+    Attributes:
+      scale: "paper" (A.1.2: all interactions, 10 seeds × 1000 episodes), "quick" (minutes),
+        or a number: that share of the paper's interactions, updates and episodes.
+      seed: training seed: of the experience, the replay and the fit. The test's are fixed.
+      engine: what steps the robot: "mjx", or "mujoco" for MuJoCo in C; MJX on an accelerator
+        and MuJoCo in C on a CPU, unless given. The Minitaur has "bullet" alone.
+      out: where runs are kept. The same command again goes on where it was.
+      literal: the paper's letter instead of our settings: h = 1, whole-episode replay,
+        λ = 0.25, mean latents, constant learning rate.
+      episodes: test episodes a seed; as the scale says, unless given.
+      results: also write the table and the figures to this directory.
+      video: also film three episodes of the test: a page and a gif, beside the controller.
+      other_code: take finished stages that other code made, and say so. Off, they are made anew.
+      test: the test (A.1.3).
+    """
+
+    scale: str = "paper"
+    seed: int = 0
+    engine: str | None = None
+    out: Path = Path("runs")
+    literal: bool = False
+    episodes: int | None = None
+    results: Path | None = None
+    video: bool = False
+    other_code: bool = False
+    test: Test = dataclasses.field(default_factory=Test)
+
+    def __post_init__(self) -> None:
+        # A seed has 32 bits: jax would take 2³² for 0.
+        check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
+
+
+def resolve(robot: Robot, method: Direct | Inverse, options: Options) -> Direct | Inverse:
+    """A method as the scale, the machine and the robot's engine have it.
+
+    On the command line this is what the flags of a method start from, so that what the user
+    sets stands, also where it equals a default.
+
+    Raises:
+      BadInput: the scale is none, or the paper has no other settings for the method.
+    """
+    scale = scale_of(options.scale, robot.paper_interactions)
+    if isinstance(method.agent, PPO) and method.agent == PPO(hidden=method.agent.hidden):
+        agent = dataclasses.replace(scale.ppo, hidden=method.agent.hidden)
+        method = dataclasses.replace(method, agent=agent)
+    if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
+        wide: Any = method.agent.wide()  # of the method's own type
+        method = dataclasses.replace(method, agent=wide)
+    if isinstance(method, Direct):
+        if options.literal:
+            raise BadInput(f"{method.name} has no settings that the paper's letter would change")
+        return method
+    method = _fitting(literal(method) if options.literal else method, scale)
+    if method.generalize:
+        method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+    return method
+
+
+def _fitting(method: Inverse, scale: Scale) -> Inverse:
+    """The method as far as a scale's record is long enough for it."""
+    agent = method.agent
+    if isinstance(agent, Frozen):
+        agent = dataclasses.replace(agent, share=max(agent.share, scale.learning))
+    updates = max(1, round(method.fit.updates * scale.updates))
+    return dataclasses.replace(
+        method,
+        agent=agent,
+        look_ahead=min(method.look_ahead, scale.look_ahead),
+        share=max(method.share, scale.share),
+        fit=dataclasses.replace(method.fit, updates=updates),
+    )
+
+
+def who_set_what(
+    method: Direct | Inverse, chosen: Direct | Inverse, given: Direct | Inverse
+) -> tuple[str, ...]:
+    """Which settings are not those of the method, who set them, and which are not the paper's.
+
+    Args:
+      method: with its defaults for the robot.
+      chosen: as scale, engine and machine have it.
+      given: as it is run.
+
+    Returns:
+      a line each for what is chosen, what the user set, and what differs from the paper.
+    """
+    papers = literal(method) if isinstance(method, Inverse) and given.name == method.name else given
+    lines = []
+    for who, before, after in (
+        ("chosen for this scale and machine", method, chosen),
+        ("set by you", chosen, given),
+        ("not the paper's (--literal has those)", papers, given),
+    ):
+        changes = [c for c in differences(before, after) if not c.startswith("name ")]
+        if changes:
+            lines.append(f"{given.name}, {who}: {', '.join(changes)}")
+    return tuple(lines)
+
+
+def differences(before: Any, after: Any) -> list[str]:
+    """Settings that differ, as "name value (value before)"."""
+    was, now = (flat(plain(x)) for x in (before, after))
+    return [
+        f"{name} {now.get(name, 'absent')} ({was.get(name, 'absent')})"
+        for name in sorted(was.keys() | now.keys())
+        if was.get(name) != now.get(name)
+    ]
