@@ -20,7 +20,7 @@ def main(
     episodes: int = 1000,
     first_seed: int = 0,
     engine: str | None = None,
-    test: Test = Test(),  # noqa: B008
+    test: Test = Test(),
 ) -> None:
     """The paper's test (A.1.3) of controllers, on as many scenarios as you like; keeps nothing.
 

@@ -55,7 +55,7 @@ def record(options: table1.Table) -> Experience:
 
 
 def main(
-    options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),  # noqa: B008
+    options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),
 ) -> None:
     """Reads the Humanoid's record in the world's frame, then runs the methods on it."""
     record(options)

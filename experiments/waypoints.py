@@ -30,7 +30,7 @@ def main(
     seed: int = 0,
     engine: str | None = None,
     out: Path = Path("runs/waypoints"),
-    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),  # noqa: B008
+    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),
 ) -> None:
     """Leads robots through waypoints, one controller after another from the same starts.
 

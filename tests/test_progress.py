@@ -107,7 +107,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch) -> None:
 
     with Progress("fit", 2, "updates", tmp_path, quiet=True) as bar:
         bar.advance(1, loss=1.0)
-        monkeypatch.setattr(bar._curves._events, "write_event", full_disk)  # type: ignore
+        monkeypatch.setattr(bar._curves._events, "write_event", full_disk)
         with pytest.raises(BadInput, match="no space left"):
             bar.advance(1, loss=2.0)
     monkeypatch.setattr(os, "fsync", full_disk)

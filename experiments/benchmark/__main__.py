@@ -53,7 +53,7 @@ def main() -> None:
     """The command line."""
 
     def command(
-        options: Annotated[Options, tyro.conf.arg(name="")] = Options(),  # noqa: B008
+        options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
     ) -> None:
         print(table(benchmark(by_name(options.robot, options.engine), options)))
 
