@@ -142,7 +142,7 @@ def arm(where: str, when: str) -> None:
         return dying
 
     def nth(bar: Progress) -> bool:
-        return bar._bar.desc.startswith(where) and next(calls) == int(when)
+        return bar.name.startswith(where) and next(calls) == int(when)
 
     if where == "finish":
         Stage.finish = at(lambda s: s.directory.name.startswith(f"{when}-"), Stage.finish)
