@@ -58,6 +58,7 @@ class Progress:
             progress.advance(4096, reward=reward)
 
     Attributes:
+      name: what is going on, in front of the bar.
       done: units done, those before a resume included.
     """
 
@@ -84,7 +85,7 @@ class Progress:
         Raises:
           BadInput: the directory cannot be written, or its metrics cannot be read.
         """
-        self.done = initial
+        self.name, self.done = name, initial
         self._curves = _Curves(Path(directory), initial) if directory is not None else None
         live = sys.stderr.isatty() or "ipykernel" in sys.modules
         self._bar = tqdm(

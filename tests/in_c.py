@@ -86,7 +86,10 @@ def assert_commutes(
     actions, after, contact = episode
     wrenches = Layout((symmetry.wrenches("contact", robot.mirror.bodies),))
     with jax.enable_x64(True):
-        on = lambda layout, x: np.asarray(change(layout, x))  # noqa: E731
+
+        def on(layout: Layout, x: np.ndarray) -> np.ndarray:
+            return np.asarray(change(layout, x))
+
         physics = [jax.tree.map(on, robot.physics, p) for p in (starts, positive_w(after))]
         outcome = on(robot.observation, observed(positive_w(after), contact))
         felt = on(wrenches, contact.reshape(len(contact), -1)).reshape(contact.shape)

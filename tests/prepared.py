@@ -18,7 +18,7 @@ class Prepared:
     def __init__(self, agent: Agent):
         self.agent, self.lanes, self.unroll = agent, agent.lanes, agent.unroll
 
-    @functools.cache  # noqa: B019
+    @functools.cache  # noqa: B019  what it keeps alive, the programs, is what it is for
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         learning = self.agent.learning(robot, task, mesh)
         ready: list[Iterate] = []

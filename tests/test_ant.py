@@ -57,7 +57,7 @@ def starts(ant: Ant) -> Physics:
 def robot(ant: Ant) -> Ant:
     """The Ant with compiled functions: one program for all of this file's steps."""
     robot = copy.copy(ant)
-    robot.step, robot.reset = jax.jit(ant.step), jax.jit(ant.reset)  # type: ignore[method-assign]
+    robot.step, robot.reset = jax.jit(ant.step), jax.jit(ant.reset)
     return robot
 
 

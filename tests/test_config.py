@@ -55,7 +55,7 @@ def test_plain_is_readable_json() -> None:
 def test_digest_sees_every_difference_and_nothing_else() -> None:
     base = config.digest(Config())
     assert re.fullmatch("[0-9a-f]{10}", base)
-    assert base == config.digest(Config(sizes=[64, np.int64(64)]))  # type: ignore[arg-type]
+    assert base == config.digest(Config(sizes=[64, np.int64(64)]))
     changed = [
         Config(inner=Inner(rate=2e-3)),
         Config(inner=Inner(colour=Colour.BLUE)),

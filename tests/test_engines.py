@@ -34,7 +34,7 @@ KINDS: dict[str, type[Ant] | type[Humanoid]] = {"ant": Ant, "humanoid": Humanoid
 def made(kind: str, engine: str) -> MujocoRobot:
     """A robot whose engine is compiled: one program for all of this file's steps in float32."""
     robot = KINDS[kind](engine=engine)
-    robot.engine.step = jax.jit(robot.engine.step)  # type: ignore[method-assign]
+    robot.engine.step = jax.jit(robot.engine.step)
     return robot
 
 

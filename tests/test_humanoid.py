@@ -31,7 +31,7 @@ def humanoid() -> Humanoid:
 def robot(humanoid: Humanoid) -> Humanoid:
     """The Humanoid with compiled functions: one program for all of this file's steps."""
     robot = copy.copy(humanoid)
-    robot.step, robot.reset = jax.jit(humanoid.step), jax.jit(humanoid.reset)  # type: ignore[method-assign]
+    robot.step, robot.reset = jax.jit(humanoid.step), jax.jit(humanoid.reset)
     return robot
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tensorboardX.event_file_writer import EventsWriter
 
 from genidm import progress
 from genidm.errors import BadInput
@@ -107,7 +108,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch) -> None:
 
     with Progress("fit", 2, "updates", tmp_path, quiet=True) as bar:
         bar.advance(1, loss=1.0)
-        monkeypatch.setattr(bar._curves._events, "write_event", full_disk)  # type: ignore
+        monkeypatch.setattr(EventsWriter, "write_event", full_disk)
         with pytest.raises(BadInput, match="no space left"):
             bar.advance(1, loss=2.0)
     monkeypatch.setattr(os, "fsync", full_disk)
@@ -121,10 +122,9 @@ def test_the_bar_shows_rate_and_time_left(capfd) -> None:
     with Progress("collect", 4000, "steps", initial=1000) as bar:
         time.sleep(0.05)
         bar.advance(1000, reward=1.23456)
-        bar._bar.refresh()
     out, err = capfd.readouterr()
     assert out == ""
-    line = err.split("\r")[-1]
+    line = err.rstrip("\n").split("\r")[-1]
     assert "collect:  50%" in line and "2.00k/4.00k" in line and "reward=1.23" in line
     assert re.search(r"\d\d:\d\d<\d\d:\d\d, *[\d.]+k? steps/s", line)
 

@@ -212,7 +212,15 @@ def test_the_paper_has_no_heading_frame(rows):
     r = document(rows)
     (line,) = [x for x in report.markdown(r).splitlines() if x.startswith("| HF ")]
     assert line.endswith("|  |")
-    assert len(report.text(document(rows, "another robot"))) > 0
+
+
+def test_the_paper_has_no_other_robots(rows):
+    r = document(rows, "another robot")
+    papers = {f"{m:.3f} ± {s:.3f}" for column in report.TABLE1.values() for m, s in column.values()}
+    for shown in (report.text(r), report.markdown(r)):
+        for name, row in r["methods"].items():
+            assert f"{row['mean']:.3f} ± {row['std']:.3f}" in shown, name
+        assert not [number for number in papers if number in shown]
 
 
 def test_the_text_fits_a_terminal_and_is_aligned(rows):
@@ -248,7 +256,10 @@ def test_a_number_that_does_not_exist_is_null_and_a_dash():
     [(640, "640"), (50_000, "50 k"), (999_900, "1 M"), (1_048_576, "1.05 M"), (15_000_000, "15 M")],
 )
 def test_counts_are_short(n, shown):
-    assert table._count(n) == shown
+    made = report.markdown(document([row("RS", interactions=n)]))
+    (line,) = [x for x in made.splitlines() if x.startswith("| RS |")]
+    columns = dict(zip(table.HEADER, line.strip("| ").split(" | "), strict=False))
+    assert columns["interactions"] == shown
 
 
 def test_table1_is_the_papers():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -17,7 +18,7 @@ from genidm.tasks import GoToGoal
 for module in ("gymnasium.envs.mujoco", "torch", "stable_baselines3"):
     pytest.importorskip(module, reason="the extra `benchmark` is not installed")
 
-from experiments import witness  # noqa: E402
+from experiments import witness  # noqa: E402  it ends the process where one is absent
 
 TASK = HER_SP.task
 assert isinstance(TASK, GoToGoal)
@@ -81,10 +82,52 @@ def test_a_fall_is_charged_for_ever(ant: Any) -> None:
     assert reward == pytest.approx(-50)
 
 
-def test_it_learns_and_is_tested(tmp_path: Path) -> None:
+class Scripted:
+    """Walks along x, a metre a step, towards a goal at 3.5 m."""
+
+    def __init__(self, steps: int, falls: bool):
+        self.steps, self.falls, self.seeds = steps, falls, []
+
+    def reset(self, seed: int) -> tuple[dict, dict]:
+        self.seeds.append(seed)
+        self.made = 0
+        return self._seen(), {}
+
+    def step(self, action: float) -> tuple[dict, float, bool, bool, dict]:
+        self.made += 1
+        over = self.made == self.steps
+        return self._seen(), 0.0, over and self.falls, over and not self.falls, {}
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        here = np.array([float(self.made), 0.0])
+        return {"achieved_goal": here, "desired_goal": np.array([3.5, 0.0])}
+
+
+@pytest.mark.parametrize(("steps", "nearest"), [(2, 1.5), (3, 0.5), (6, 0.5)])
+@pytest.mark.parametrize("falls", [False, True])
+def test_what_counts_is_how_near_an_episode_came(steps: int, nearest: float, falls: bool) -> None:
+    env = Scripted(steps, falls)
+    np.testing.assert_array_equal(witness.closest(env, lambda _: 0.0, 2), [nearest, nearest])
+    assert len(set(env.seeds)) == 2
+
+
+def test_a_summary_is_of_all_episodes() -> None:
+    made = witness.summary(np.array([0.5, 1.0, 1.5, 3.0]))
+    assert made == pytest.approx(dict(mean=1.5, std=0.875**0.5, within_1_m=0.5, episodes=4))
+
+
+def test_it_learns_and_is_tested(tmp_path: Path, monkeypatch) -> None:
+    """Random actions are those of the seed; what learns is another controller after each part."""
     env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
     env_checker.check_env(witness.GoalAnt(TASK, 20))
+    early = dataclasses.replace(HER_SP, agent=dataclasses.replace(HER_SP.agent, warmup=100))
+    monkeypatch.setattr(witness, "HER_SP", early)
     witness.main(tmp_path / "w.json", interactions=1000, episodes=2, parts=2)
     result = json.loads((tmp_path / "w.json").read_text())
+    again = witness.GoalAnt(TASK, 1000)
+    again.action_space.seed(0)
+    drawn = witness.closest(again, lambda _: again.action_space.sample(), 2)
+    assert result["random"] == pytest.approx(witness.summary(drawn))
     assert list(result["HER + SAC"]) == ["504", "1008"]  # whole rounds of 8
-    assert 0 < result["random"]["mean"] < 6 and 0 < result["HER + SAC"]["1008"]["mean"] < 6
+    first, second = result["HER + SAC"].values()
+    assert first["mean"] != second["mean"]

@@ -92,7 +92,10 @@ def _parts(this: Cell[Any], bank: Scenarios) -> Iterator[Part]:
         share = this.method.share
         yield part("collecting", this.experience_stage, this.experience)
         if this.replay_stage:
-            again = lambda: this.replay(this.experience().first_share(share))  # noqa: E731
+
+            def again() -> Any:
+                return this.replay(this.experience().first_share(share))
+
             yield part("𝒢", this.replay_stage, again)
     learning = part("learning", this.controller_stage, this.controller)
     yield learning

@@ -206,7 +206,10 @@ def _updates(settings: Fit) -> Any:
     def update(learner: Learner, samples: Pairs) -> tuple[Learner, dict[str, jax.Array]]:
         # The key of an update depends on its number alone, not on the call it is in.
         batch = draw(samples, jax.random.fold_in(learner.key, learner.update), settings.batch)
-        of_params = lambda params: loss(learner.model.replace(params=params), batch)  # noqa: E731
+
+        def of_params(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+            return loss(learner.model.replace(params=params), batch)
+
         grads, info = jax.grad(of_params, has_aux=True)(learner.model.params)
         step, state = optimizer.update(grads, learner.optimizer)
         model = learner.model.replace(params=optax.apply_updates(learner.model.params, step))

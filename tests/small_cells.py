@@ -1,0 +1,114 @@
+"""Cells on a point, at a size that a test can wait for, and what they leave."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from point import Point
+from tiny import TEST, tiny
+
+from genidm.runs import command as experiment, run as cells
+from genidm.paper import methods
+from genidm.runs.resolve import Options
+from genidm.runs.cell import cell, run_cell
+from genidm.paper.methods import Inverse, Method
+from genidm.evaluation.scenarios import Scenarios, scenarios
+
+
+def small(method: Inverse) -> Inverse:
+    """Tiny, with updates enough to be killed among."""
+    fit = dataclasses.replace(
+        tiny(method).fit, updates=2500, latent_size=method.fit.latent_size and 2
+    )
+    return tiny(method, look_ahead=10, fit=fit)
+
+
+RS, GE, LR = (small(m) for m in (methods.RS, methods.GE, methods.LR))
+VGCP, HER_SP = (tiny(m) for m in (methods.VGCP, methods.HER_SP))
+
+
+def options(out: Path, **changes) -> Options:
+    return dataclasses.replace(Options(scale="0.5", out=out, episodes=2, test=TEST), **changes)
+
+
+STAGES = ("collect", "replay", "fit", "run")
+
+
+@contextlib.contextmanager
+def counted() -> Iterator[Counter]:
+    """Which stages' work is done meanwhile, and how often."""
+    calls: Counter = Counter()
+
+    def counting(name: str, work: Callable) -> Callable:
+        def counted(*args, **kwargs):
+            calls[name] += 1
+            return work(*args, **kwargs)
+
+        return counted
+
+    with pytest.MonkeyPatch.context() as m:
+        for name in STAGES:
+            m.setattr(cells, name, counting(name, getattr(cells, name)))
+        yield calls
+
+
+@dataclasses.dataclass
+class Finished:
+    """Runs of cells, one after another, what each of them had to do, and their report."""
+
+    out: Path
+    report: Path
+    done: list[Counter]
+
+    @property
+    def results(self) -> dict:
+        return json.loads((self.report / "results.json").read_text())
+
+
+def finish(out: Path, *of: Method) -> Finished:
+    """Runs the cells of these methods in one place; they share what they can."""
+    done = []
+    for method in of:
+        with counted() as calls:
+            if method is of[-1]:
+                report = run_cell(Point(), method, options(out))
+            else:
+                cell(Point(), method, options(out)).episodes(bank("point", 10, 2))
+        done.append(calls)
+    return Finished(out, report, done)
+
+
+@functools.cache
+def bank(name: str, *numbers: int) -> Scenarios:
+    """Scenarios are drawn once for all cells: they see the robot and two numbers alone."""
+    return scenarios(Point(), *numbers)
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    paths = (p for p in sorted(directory.rglob("*")) if p.is_file())
+    return {str(p.relative_to(directory)): p.read_bytes() for p in paths}
+
+
+def arrays(stage: Path) -> dict[str, bytes]:
+    return {n: x for n, x in files(stage).items() if n.endswith(".npy") and "checkpoint" not in n}
+
+
+def stage_of(out: Path, name: str) -> Path:
+    return next((out / "point").glob(f"{name}-*"))
+
+
+def command(out: Path, *flags: str, robot: type[Point] = Point, method: Method = LR) -> None:
+    """The command line of a cell, at the scale of these tests."""
+    test = ("--test.max-steps", "40", "--test.lanes", "16", "--test.chunk", "10")
+    start = ("cell", "--scale", "0.5", "--episodes", "2", "--out", str(out), *test)
+    with pytest.MonkeyPatch.context() as m:
+        m.setattr(sys, "argv", [*start, *flags])
+        experiment.main(robot, method)
