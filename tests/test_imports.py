@@ -16,7 +16,7 @@ PACKAGE = Path(genidm.__file__).parent
 # Modules on one line know nothing of each other.
 ORDER = """
 errors episodes quiet
-checks devices
+checks devices registry
 symmetry
 genidm
 config
@@ -24,11 +24,11 @@ files
 checkpoints progress
 store
 engines.base engines.pool
-engines.mjx engines.mujoco engines.bullet
+engines.*
 engines
 robots.base robots.minitaur_world
 robots.mujoco
-robots.minitaur robots.ant robots.humanoid robots.logged
+robots.*
 robots.minitaur_env
 robots
 rollout tasks
