@@ -1,1 +1,101 @@
-"""genidm: goal-directed locomotion learned from experience that was never goal-directed."""
+"""genidm: goal-directed locomotion learned from experience that was never goal-directed.
+
+The names in `__all__` are the public API (docs/api.md). Each is imported when it is first used, so
+`import genidm` itself does no work and does not import jax.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from genidm import engines as engines
+    from genidm import methods as methods
+    from genidm import report as report
+    from genidm import robots as robots
+    from genidm import symmetry as symmetry
+    from genidm import video as video
+    from genidm.agents.ddpg import DDPG as DDPG
+    from genidm.agents.frozen import Frozen as Frozen
+    from genidm.agents.her import HER as HER
+    from genidm.agents.ppo import PPO as PPO
+    from genidm.agents.random import RandomActions as RandomActions
+    from genidm.agents.sac import SAC as SAC
+    from genidm.collect import collect as collect
+    from genidm.controller import Controller as Controller
+    from genidm.controller import load as load
+    from genidm.controller import pretrained as pretrained
+    from genidm.episodes import Episodes as Episodes
+    from genidm.errors import BadInput as BadInput
+    from genidm.evaluate import Test as Test
+    from genidm.evaluate import evaluate as evaluate
+    from genidm.experience import Experience as Experience
+    from genidm.fit import Fit as Fit
+    from genidm.fit import fit as fit
+    from genidm.generalize import Generalize as Generalize
+    from genidm.generalize import generalize as generalize
+    from genidm.methods import GE as GE
+    from genidm.methods import HER_DE as HER_DE
+    from genidm.methods import HER_SP as HER_SP
+    from genidm.methods import HF as HF
+    from genidm.methods import LR as LR
+    from genidm.methods import RL as RL
+    from genidm.methods import RS as RS
+    from genidm.methods import VGCP as VGCP
+    from genidm.robots import Ant as Ant
+    from genidm.robots import Humanoid as Humanoid
+    from genidm.robots import HumanoidWorld as HumanoidWorld
+    from genidm.robots import Logged as Logged
+    from genidm.robots import Minitaur as Minitaur
+    from genidm.robots import Robot as Robot
+    from genidm.scenarios import Scenarios as Scenarios
+    from genidm.scenarios import scenarios as scenarios
+    from genidm.symmetry import Layout as Layout
+    from genidm.tasks import Dense as Dense
+    from genidm.tasks import GoToGoal as GoToGoal
+    from genidm.tasks import Sparse as Sparse
+    from genidm.tasks import WalkForward as WalkForward
+    from genidm.waypoints import Follow as Follow
+    from genidm.waypoints import follow as follow
+
+# Module → the public names that come from it, in the order of docs/api.md; a module without
+# names is public itself. A test compares this with the imports above.
+_HOMES: dict[str, tuple[str, ...]] = {
+    "robots": ("Ant", "Humanoid", "HumanoidWorld", "Minitaur", "Logged", "Robot"),
+    "agents.ppo": ("PPO",),
+    "agents.sac": ("SAC",),
+    "agents.ddpg": ("DDPG",),
+    "agents.her": ("HER",),
+    "agents.frozen": ("Frozen",),
+    "agents.random": ("RandomActions",),
+    "tasks": ("WalkForward", "GoToGoal", "Sparse", "Dense"),
+    "collect": ("collect",),
+    "experience": ("Experience",),
+    "generalize": ("generalize", "Generalize"),
+    "fit": ("fit", "Fit"),
+    "controller": ("Controller", "load", "pretrained"),
+    "scenarios": ("scenarios", "Scenarios"),
+    "evaluate": ("evaluate", "Test"),
+    "episodes": ("Episodes",),
+    "waypoints": ("follow", "Follow"),
+    "methods": ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR", "HF"),
+    "symmetry": ("Layout",),
+    "errors": ("BadInput",),
+}
+_MODULES = ("engines", "methods", "report", "robots", "symmetry", "video")
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [*_HOME, *_MODULES]
+
+if not TYPE_CHECKING:  # a type checker would take every name for one of these
+
+    def __getattr__(name: str) -> Any:
+        if name in _MODULES:
+            return import_module(f"genidm.{name}")
+        if name not in _HOME:
+            raise AttributeError(f"module 'genidm' has no attribute {name!r}")
+        found = getattr(import_module(f"genidm.{_HOME[name]}"), name)
+        globals()[name] = found
+        return found
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

@@ -18,7 +18,6 @@ ORDER = """
 errors episodes quiet
 checks devices registry
 symmetry
-genidm
 config
 files
 checkpoints progress
@@ -67,6 +66,7 @@ video.shooting video.pages
 video
 experiment
 video.__main__
+genidm
 """
 
 RANKS = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

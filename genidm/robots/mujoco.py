@@ -131,7 +131,7 @@ class MujocoRobot(Robot):
     engine: Engine
     model: ClassVar[PathLike[str] | str]
     frames: ClassVar[int]
-    healthy_height: tuple[float, float]
+    healthy_height: ClassVar[tuple[float, float]]
     target_distance = (2.0, 5.0)
     alive_bonus = 1.0
     paper_interactions = 2_000_000
