@@ -64,14 +64,14 @@ def test_a_robot_without_a_file_of_its_own_is_run(
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
-        ([], "give --robot and --method; robots: ant, humanoid, humanoid_world, minitaur; methods: "),
+        ([], "give --robot and --method; robots: ant, humanoid, humanoid_world, minitaur; me"),
         (["--robot", "ant"], "give --robot and --method; robots: ant, "),
         (["--method", "LR"], "give --robot and --method; robots: ant, "),
         (["--robot", "any", "--method", "LR"], "no robot is called 'any'; robots: ant, humanoid, "),
         (["--robot", "ant", "--method", "XX"], "no method is called 'XX'; there are: RS, RL, VGCP"),
         (["--robot", "ant", "--method", "lr"], "no method is called 'lr'; there are: RS, RL, VGCP"),
         (["--method", "LR", "--robot"], "argument --robot: expected one argument"),
-        (["--robot", "ant", "--method", "--scale", "1"], "argument --method: expected one argument"),
+        (["--robot", "ant", "--method", "--scale", "1"], "argument --method: expected one"),
         (["--robot", "ant", "--method", "LR", "--scale", "x"], "--scale takes "),
     ],
 )  # fmt: skip
