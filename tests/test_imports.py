@@ -147,17 +147,17 @@ def test_the_package_imports_neither_its_experiments_nor_its_tests() -> None:
     ("source", "edges"),
     [
         ("from genidm import errors", []),
-        ("import genidm.fit", ["store imports fit"]),
-        ("from genidm import fit", ["store imports fit"]),
+        ("import genidm.stats", ["store imports stats"]),
+        ("from genidm import stats", ["store imports stats"]),
         ("from genidm.robots import ant", ["store imports robots.ant"]),
         ("from genidm.robots import Robot", ["store imports robots"]),
         ("from genidm.robots.ant import Ant", ["store imports robots.ant"]),
-        ("def f():\n    from genidm.fit import Fit", ["store imports fit"]),
+        ("def f():\n    from genidm.stats import summary", ["store imports stats"]),
         ("import numpy, os.path\nfrom jax import jit", []),
     ],
 )
 def test_a_back_edge_is_seen_however_it_is_written(source: str, edges: list[str]) -> None:
-    empty = dict.fromkeys(("errors", "fit", "robots", "robots.ant"), "")
+    empty = dict.fromkeys(("errors", "stats", "robots", "robots.ant"), "")
     assert back_edges({**empty, "store": source}) == edges
 
 
