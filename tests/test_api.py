@@ -42,7 +42,7 @@ def test_every_name_is_once_there_and_listed_by_dir() -> None:
 
 
 def test_no_name_is_that_of_a_module_or_of_two_things() -> None:
-    """`import genidm.fit` would else put a module where the function was."""
+    """Importing the module would else put it where the function was."""
     package = Path(genidm.__file__).parent
     modules = {p.stem for p in package.glob("*.py")} | {
         p.parent.name for p in package.glob("*/*.py")
@@ -160,4 +160,4 @@ def test_the_pages_programs_use_names_that_are_there() -> None:
 
 
 if __name__ == "__main__":
-    print(page())
+    (ROOT / "docs" / "api.md").write_text(page() + "\n", encoding="utf-8")
