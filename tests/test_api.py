@@ -135,7 +135,7 @@ def entry(name: str) -> str:
     call = name if inspect.isclass(thing) or not callable(thing) else f"{name}(…)"
     what = first_sentence(thing)
     if not inspect.isclass(thing) and not callable(thing):
-        what = f"The method {name}: a record, a `{type(thing).__name__}`."
+        what = f"The record of the method {name} (`{type(thing).__name__}`)."
     return f"| `genidm.{call}` | {what} |"
 
 
