@@ -189,8 +189,9 @@ def test_a_model_that_does_not_fit_is_refused(
 
 
 def test_the_page_engine_gives_the_bits_of_mujoco_in_c(
-    loop: type[Engine], toy: type[MujocoRobot]
+    loop: type[Engine], toy: type[MujocoRobot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT where it runs
     made, usual = toy(engine="loop"), toy(engine="mujoco")
     assert isinstance(made.engine, loop) and made.settings["engine"] == "loop"
     state = usual.reset(jax.random.split(jax.random.key(1), 4), jnp.zeros(4))
