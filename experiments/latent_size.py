@@ -87,9 +87,9 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
     here = first.root / f"{KIND}-{first.scale.name}"
     for directory in (here, options.results):
         if directory:
-            files.save_json(directory / f"{robot.name}_{KIND}.json", written)
+            files.save_json(Path(directory) / f"{robot.name}_{KIND}.json", written)
             closest = {k: [stats.masked(t) for t in fits] for k, fits in tests.items()}
-            path = directory / f"{robot.name}_{KIND}.png"
+            path = Path(directory) / f"{robot.name}_{KIND}.png"
             latent_sizes(closest, path, method.fit.latent_size)
     files.save_text(here / "table.txt", text(written))
     return here

@@ -98,8 +98,7 @@ def ours(processes: int, actions: np.ndarray, lanes: int = 128) -> Vectorised:
         step(state, action).position.block_until_ready()
 
     once()
-    pids = [w.process.pid for w in robot.engine.pool._idle.queue if w]
-    return Vectorised("Minitaur", lanes, pids, once)
+    return Vectorised("Minitaur", lanes, robot.engine.pool.processes, once)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +26,15 @@ import numpy as np
 import tyro
 
 from genidm import devices, files, symmetry
-from genidm.engines import Physics
+from genidm.engines import ENGINES, Physics
+from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
 from genidm.progress import Progress, compiled
 from genidm.provenance import environment
-from genidm.robots import Ant, Humanoid, State
+from genidm.robots import ROBOTS, State
 from genidm.robots.base import select
 from genidm.robots.mujoco import MujocoRobot, Solver
 from genidm.runs.command import guarded
-
-ROBOTS = {"ant": Ant, "humanoid": Humanoid}
 
 OURS = Solver(iterations=4, line_search=8, elliptic=True)
 SETTINGS = (
@@ -60,12 +59,7 @@ class Precision(NamedTuple):
     dtype: str
 
 
-# As robots are run. MJX computes in float32; MuJoCo in C computes in float64 and rounds its rows.
-AS_RUN = (
-    Precision("MJX float32", "mjx", "float32"),
-    Precision("C float32 rows", "mujoco", "float32"),
-)
-UNROUNDED = Precision("C float64 rows", "mujoco", "float64")
+UNROUNDED = Precision("C float64 rows", MuJoCo.name, "float64")
 
 # Of the steps asked for, the share that settings other than ours are given.
 OTHERS = 0.128
@@ -81,14 +75,14 @@ class Options:
     """What is measured.
 
     Attributes:
-      robot: by its name.
+      robot: by its name; one with a MuJoCo model.
       steps: control steps of elliptic 4/8; the other settings are given 0.128 of them.
       lanes: robots at once; a multiple of the number of devices.
       seed: of starts, actions and yaws.
       out: the JSON file; under experiments/results, unless given.
     """
 
-    robot: Literal["ant", "humanoid"] = "ant"
+    robot: str = "ant"
     steps: int = 1_000_000
     lanes: int = 128
     seed: int = 0
@@ -96,6 +90,11 @@ class Options:
 
     def check(self) -> None:
         """Raises BadInput for what cannot be measured."""
+        modelled = [name for name, kind in ROBOTS.items() if issubclass(kind, MujocoRobot)]
+        if self.robot not in modelled:
+            raise BadInput(
+                f"no robot {self.robot!r} has a MuJoCo model; {', '.join(modelled)} have"
+            )
         if min(self.steps, self.lanes) < 1:
             raise BadInput("--steps and --lanes must be at least 1")
         if self.lanes % jax.device_count():
@@ -103,12 +102,18 @@ class Options:
 
     def with_solver(self, solver: Solver, engine: str) -> MujocoRobot:
         """The robot on that engine, under these settings of the solver."""
-        return ROBOTS[self.robot](solver, engine)
+        kind: Any = ROBOTS[self.robot]
+        return kind(solver=solver, engine=engine)
 
     def episodes(self, solver: Solver) -> int:
         """Episodes of every lane: the steps asked for, rounded up."""
         steps = self.steps if solver == OURS else OTHERS * self.steps
         return math.ceil(steps / (self.lanes * EPISODE))
+
+
+def as_run() -> list[Precision]:
+    """Every engine, with the float32 rows that robots are run with."""
+    return [Precision(engine.label, name, "float32") for name, engine in ENGINES.items()]
 
 
 def setting(solver: Solver) -> str:
@@ -166,7 +171,7 @@ def stability(options: Options) -> list[dict[str, Any]]:
     """A row for each setting and engine."""
     rows = []
     for solver in SETTINGS:
-        for precision in AS_RUN:
+        for precision in as_run():
             robot = options.with_solver(solver, precision.engine)
             name = f"{setting(solver)} {precision.name}"
             row = endure(robot, name, options.episodes(solver), options)
@@ -194,7 +199,7 @@ def walked(
 
 def starts(options: Options) -> Physics:
     """Physics `[B, ...]` of robots that have been shaken for a second, in float32's numbers."""
-    robot = options.with_solver(OURS, "mujoco")
+    robot = options.with_solver(OURS, MuJoCo.name)
     fresh, shakes = jax.random.split(jax.random.key(options.seed))
     still = jnp.zeros(options.lanes)
     state = robot.reset(jax.random.split(fresh, options.lanes), still)
@@ -224,7 +229,7 @@ def drifts(options: Options) -> list[dict[str, Any]]:
     yaw = rng.uniform(-np.pi, np.pi, options.lanes)
     rows = []
     for solver in (s for s in SETTINGS if s.iterations == OURS.iterations):
-        for precision in (*AS_RUN, UNROUNDED):
+        for precision in (*as_run(), UNROUNDED):
             robot = options.with_solver(solver, precision.engine)
             shape = (max(LOOK), options.lanes, robot.action.size)
             actions = np.asarray(strong(jax.random.key(options.seed + 2), shape))
@@ -283,7 +288,7 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
     stable, turned = stability(options), drifts(options)
     results = {
         "options": options,
-        "engines": {p.name: str(options.with_solver(OURS, p.engine).engine) for p in AS_RUN},
+        "engines": {p.name: str(options.with_solver(OURS, p.engine).engine) for p in as_run()},
         # Timings of a machine that does other things beside are only indicative.
         "load": [before, os.getloadavg()[0]],
         "stability": stable,

@@ -26,7 +26,7 @@ def main(
     Raises:
       BadInput: there is none.
     """
-    policies = sorted(root.glob("experience-*/policy"))
+    policies = sorted(Path(root).glob("experience-*/policy"))
     if not policies:
         raise BadInput(f"no agent has collected under {root}: it is to be as runs/ant is")
     for path in policies:

@@ -120,6 +120,9 @@ def pretrained(robot: str) -> Controller | Policy:
 
     Its directory, `genidm/pretrained/ROBOT`, says how: it is that of a run.
 
+    Args:
+      robot: name of the robot.
+
     Raises:
       BadInput: none comes for this robot.
     """

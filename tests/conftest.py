@@ -21,8 +21,8 @@ import pytest
 import small_cells
 from small_cells import Finished
 
-from genidm.runs import command as experiment
 from genidm.robots import Ant
+from genidm.runs import command as experiment
 
 
 @pytest.fixture(scope="session")

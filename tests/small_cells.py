@@ -15,12 +15,13 @@ import pytest
 from point import Point
 from tiny import TEST, tiny
 
-from genidm.runs import command as experiment, run as cells
-from genidm.paper import methods
-from genidm.runs.resolve import Options
-from genidm.runs.cell import cell, run_cell
-from genidm.paper.methods import Inverse, Method
 from genidm.evaluation.scenarios import Scenarios, scenarios
+from genidm.paper import methods
+from genidm.paper.methods import Inverse, Method
+from genidm.runs import command as experiment
+from genidm.runs import run as cells
+from genidm.runs.cell import cell, run_cell
+from genidm.runs.resolve import Options
 
 
 def small(method: Inverse) -> Inverse:

@@ -23,7 +23,7 @@ from experiments.benchmark import collecting, comparing, fitting, others, sb3, s
 from experiments.benchmark.bench import Bench, Options
 from experiments.benchmark.comparing import Row
 from experiments.benchmark.measuring import Probe, Skip, interleave, timed
-from experiments.benchmark.rows import ANT, HUMANOID, ROWS, choose
+from experiments.benchmark.rows import ANT, HUMANOID, OTHERS, ROWS, choose
 from genidm.errors import BadInput
 from genidm.paper.idm import Architecture
 from genidm.paper.methods import GE, LR
@@ -197,11 +197,11 @@ def test_choose_takes_what_a_row_is_compared_with():
         choose(["nothing"], ANT)
 
 
-@pytest.mark.parametrize("robot", ROWS)
-def test_rows_name_each_other(robot):
-    names = [row.name for row in ROWS[robot]]
+@pytest.mark.parametrize("rows", [*ROWS.values(), OTHERS])
+def test_rows_name_each_other(rows):
+    names = [row.name for row in rows]
     assert len(set(names)) == len(names)
-    assert {row.ratio_to for row in ROWS[robot]} <= {*names, None}
+    assert {row.ratio_to for row in rows} <= {*names, None}
     assert not any(" (" in name for name in names)  # where the table cuts
 
 
@@ -244,6 +244,11 @@ def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
         command.main()
     assert stop.value.code == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_robot_without_a_model_has_no_rows():
+    with pytest.raises(BadInput, match="rows for robots with a MuJoCo model, not for the point"):
+        command.benchmark(Point(), Options(out=Path("nowhere.json")))
 
 
 def test_the_baseline_runs_without_jax():

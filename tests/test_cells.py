@@ -13,16 +13,16 @@ from point import Point
 from small_cells import LR, VGCP, Finished, command, counted, files, options, stage_of
 from tiny import TEST
 
-from genidm.runs import run as cells
 from genidm import controller
-from genidm.evaluation import stats
 from genidm.agents.policy import Policy
+from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
-from genidm.runs.cell import cell, run_cell
+from genidm.evaluation.scenarios import scenarios
 from genidm.files import load_arrays
 from genidm.paper.generalize import Generalize
 from genidm.progress import METRICS, read_metrics
-from genidm.evaluation.scenarios import scenarios
+from genidm.runs import run as cells
+from genidm.runs.cell import cell, run_cell
 from genidm.store import Stage
 from genidm.tasks import WalkForward
 

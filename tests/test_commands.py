@@ -17,18 +17,19 @@ from small_cells import HER_SP, LR, Finished, command, files, stage_of
 from tiny import TEST
 
 from experiments import evaluate, walk, waypoints
-from genidm.runs import command as experiment, run as cells
 from genidm import controller
-from genidm.paper import methods
 from genidm.errors import BadInput
-from genidm.runs.resolve import Options
-from genidm.runs.cell import cell
+from genidm.evaluation.waypoints import Follow
 from genidm.files import load_arrays, save_arrays
+from genidm.paper import methods
 from genidm.paper.methods import literal
 from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur, Robot
+from genidm.runs import command as experiment
+from genidm.runs import run as cells
+from genidm.runs.cell import cell
+from genidm.runs.resolve import Options
 from genidm.runs.scale import Scale, scale_of
 from genidm.store import Stage
-from genidm.evaluation.waypoints import Follow
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.usefixtures("one_bank")

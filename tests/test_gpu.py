@@ -48,7 +48,7 @@ def small(monkeypatch) -> None:
     monkeypatch.setattr(cells, "TEST", TEST)
     for module in (experiment, jobs):
         monkeypatch.setattr(module, "write_report", reported)
-    monkeypatch.setattr(speeds, "LANES", {"mujoco": (4, 8)})
+    monkeypatch.setattr(speeds, "FEW_LANES", (4, 8))
     monkeypatch.setattr(speeds, "STEPS", 2)
     monkeypatch.setattr(speeds, "SECONDS", 0.0)
 

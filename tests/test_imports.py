@@ -15,20 +15,20 @@ PACKAGE = Path(genidm.__file__).parent
 
 # Modules on one line know nothing of each other.
 ORDER = """
-errors episodes quiet
-checks devices
+errors evaluation.episodes quiet paper.protocol
+checks devices registry
 symmetry
-genidm
+evaluation paper runs
 config
 files
-checkpoints progress
+checkpoints progress provenance
 store
 engines.base engines.pool
-engines.mjx engines.mujoco engines.bullet
+engines.*
 engines
 robots.base robots.minitaur_world
 robots.mujoco
-robots.minitaur robots.ant robots.humanoid robots.logged
+robots.*
 robots.minitaur_env
 robots
 rollout tasks
@@ -40,33 +40,34 @@ agents.off_policy
 agents.*
 agents.frozen
 agents
-collect
-replaying
-pairs
-generalize
-models
+agents.collect
+paper.replaying
+paper.pairs
+paper.generalize paper.idm
 controller
-fit
-scenarios
-evaluator
-evaluate
-invariance waypoints
-stats
-report.paper
+paper.fit
+evaluation.scenarios
+evaluation.evaluator
+evaluation.evaluate
+evaluation.invariance evaluation.waypoints
+evaluation.stats
 report.rows
 report.table report.drawing
 report.figures report.journeys
 report
-methods scale
-cells
+paper.methods
+runs.scale
+runs.resolve runs.run
 report.runs
 report.shown
 report.write
 video.filming video.scenery video.backends video.clip
 video.shooting video.pages
 video
-experiment
+runs.cell
+runs.command
 video.__main__
+genidm
 """
 
 RANKS = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}
@@ -147,17 +148,17 @@ def test_the_package_imports_neither_its_experiments_nor_its_tests() -> None:
     ("source", "edges"),
     [
         ("from genidm import errors", []),
-        ("import genidm.paper.fit", ["store imports fit"]),
-        ("from genidm import fit", ["store imports fit"]),
+        ("import genidm.experience", ["store imports experience"]),
+        ("from genidm import experience", ["store imports experience"]),
         ("from genidm.robots import ant", ["store imports robots.ant"]),
         ("from genidm.robots import Robot", ["store imports robots"]),
         ("from genidm.robots.ant import Ant", ["store imports robots.ant"]),
-        ("def f():\n    from genidm.paper.fit import Fit", ["store imports fit"]),
+        ("def f():\n    from genidm.experience import Experience", ["store imports experience"]),
         ("import numpy, os.path\nfrom jax import jit", []),
     ],
 )
 def test_a_back_edge_is_seen_however_it_is_written(source: str, edges: list[str]) -> None:
-    empty = dict.fromkeys(("errors", "fit", "robots", "robots.ant"), "")
+    empty = dict.fromkeys(("errors", "experience", "robots", "robots.ant"), "")
     assert back_edges({**empty, "store": source}) == edges
 
 

@@ -27,8 +27,8 @@ from point import Point
 from small_cells import LR, VGCP, Finished, arrays, counted, options, stage_of
 
 from genidm.agents import collect as collecting
-from genidm.runs.cell import run_cell
 from genidm.progress import Progress
+from genidm.runs.cell import run_cell
 from genidm.store import Stage
 
 ROOT = Path(__file__).parents[1]

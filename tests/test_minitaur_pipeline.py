@@ -79,10 +79,9 @@ def test_workers_that_are_killed_meanwhile_take_nothing_with_them(
     advance, shot = Progress.advance, []
 
     def shoot(self: Progress, *args: Any, **kwargs: Any) -> None:
-        for worker in list(robot.engine.pool._idle.queue):
-            if worker:
-                shot.append(worker.process.pid)
-                os.kill(worker.process.pid, signal.SIGKILL)
+        for process in robot.engine.pool.processes:
+            shot.append(process)
+            os.kill(process, signal.SIGKILL)
         advance(self, *args, **kwargs)
 
     monkeypatch.setattr(Progress, "advance", shoot)

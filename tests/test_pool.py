@@ -36,7 +36,7 @@ def rows(count: int) -> np.ndarray:
 
 def workers(pool: Pool) -> list[int]:
     """Process ids of the idle ones."""
-    return [worker.process.pid for worker in pool._idle.queue if worker]
+    return pool.processes
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 100])

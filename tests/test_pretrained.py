@@ -14,9 +14,9 @@ import pytest
 from genidm.controller import PRETRAINED, load, pretrained
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.scenarios import scenarios
 from genidm.files import load_json
 from genidm.robots import ROBOTS, Ant
-from genidm.evaluation.scenarios import scenarios
 
 Change = Callable[[jax.Array], jax.Array]
 NAMES = sorted(path.name for path in PRETRAINED.iterdir())

@@ -11,10 +11,11 @@ import tyro
 from experiments.benchmark.bench import Bench, Options
 from experiments.benchmark.comparing import measure, table
 from experiments.benchmark.evaluating import controller
-from experiments.benchmark.rows import ROWS, choose
+from experiments.benchmark.rows import OTHERS, ROWS, choose
 from genidm import files
 from genidm.errors import BadInput
 from genidm.robots import Robot, by_name
+from genidm.robots.mujoco import MujocoRobot
 from genidm.runs.command import guarded
 
 
@@ -25,9 +26,9 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
       BadInput: unknown rows, lanes that the devices cannot share, a run that is none, or a
         place that cannot be written.
     """
-    if robot.name not in ROWS:
-        raise BadInput(f"there are rows for {' and '.join(ROWS)}, not for {robot.name}")
-    rows, out = choose(options.rows, ROWS[robot.name]), place(robot, options)
+    if robot.name not in ROWS and not isinstance(robot, MujocoRobot):
+        raise BadInput(f"there are rows for robots with a MuJoCo model, not for the {robot.name}")
+    rows, out = choose(options.rows, ROWS.get(robot.name, OTHERS)), place(robot, options)
     for lanes in (options.lanes, options.wide):
         if lanes % robot.mesh().size:
             raise BadInput(f"{lanes} lanes cannot be shared among {robot.mesh().size} devices")
@@ -46,7 +47,7 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
 
 def place(robot: Robot, options: Options) -> Path:
     """Where the rows are written."""
-    return options.out or Path(f"experiments/results/{robot.name}_benchmark.json")
+    return Path(options.out or f"experiments/results/{robot.name}_benchmark.json")
 
 
 def main() -> None:

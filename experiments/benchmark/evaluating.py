@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -36,7 +37,7 @@ WARM_UP = 100
 def controller(bench: Bench) -> Steering:
     """That of the run, or an untrained one."""
     if bench.options.run:
-        return load(bench.options.run / "controller", bench.robot)
+        return load(bench.options.run, bench.robot)
     turned = rotate(bench.robot, bench.once(record), jax.random.key(1))
     # To the next step, as the episodes of a short record may all end before more.
     samples = pairs(bench.robot, bench.once(record), turned, look_ahead=1)
@@ -133,4 +134,4 @@ def _test(bench: Bench) -> tuple[Test, Scenarios]:
 
 def _steering(bench: Bench) -> str:
     """Whose controller it is."""
-    return bench.options.run.name if bench.options.run else "an untrained controller"
+    return Path(bench.options.run).name if bench.options.run else "an untrained controller"

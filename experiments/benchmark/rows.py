@@ -135,6 +135,14 @@ HUMANOID: tuple[Row, ...] = (
     *_fits(_of_humanoid("LR")),
     *_fits(_of_humanoid("GE")),
 )
+OTHERS: tuple[Row, ...] = (
+    *_STEPPING,
+    Row("collecting, PPO", "steps/s", _PPO, _OWN),
+    *_RUNNING,
+    *_fits(LR),
+    *_fits(GE),
+)
+"""Rows of any other robot with a MuJoCo model."""
 ROWS = {"ant": ANT, "humanoid": HUMANOID}
 """Robot → its rows: what its agents are, and what there is to compare with."""
 

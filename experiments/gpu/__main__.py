@@ -119,8 +119,8 @@ class Call:
         return self.options.methods or CELLS.get(robot, ("LR",))
 
     def _speeds(self, job: Job, seconds: float) -> None:
-        """Both engines' speeds; MuJoCo's first, which compiles nothing that takes long."""
-        engines = sorted(ROBOTS[job.robot].engines or ("",), key=lambda name: name == "mjx")
+        """The engines' speeds; first of those that compile nothing that takes long."""
+        engines = sorted(ROBOTS[job.robot].engines or ("",), key=compiles_long)
         end = self.clock.left - seconds
         for left, engine in zip(range(len(engines), 0, -1), engines, strict=True):
             part, share = replace(job, part="speeds", engine=engine), IN_C if left > 1 else 1.0
@@ -140,7 +140,7 @@ class Call:
         """Says of a stage that was under way how far it is."""
         seconds = round(row["seconds"] + time.time() - row["began"], 1)
         rest = {name: x for name, x in row.items() if name != "began"}
-        step = _step(self.options.run_dir / row["robot"], since)
+        step = _step(Path(self.options.run_dir) / row["robot"], since)
         self.results.put("stages", rest | {"seconds": seconds, "step": step})
 
     def _do(self, job: Job, seconds: float) -> bool:
@@ -171,6 +171,11 @@ class Call:
                 at = f" at step {row['step']:,}" if row.get("step") else ""
                 parts.append(f"{row['robot']} {row['method']} is {row['part']}{at}")
         return "; ".join(parts)
+
+
+def compiles_long(engine: str) -> bool:
+    """Whether an engine, by its name, is made of jax operations."""
+    return engine in ENGINES and ENGINES[engine].on_accelerator
 
 
 def _title(job: Job) -> str:

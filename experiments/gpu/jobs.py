@@ -56,7 +56,8 @@ class Job:
     def stepper(self) -> str:
         """Name of the engine that steps the robot: the one asked for, if it can."""
         offered = ROBOTS[self.robot].engines
-        return self.engine if self.engine in offered else offered[0] if offered else "its own"
+        asked = self.engine
+        return asked if asked is not None and asked in offered else next(iter(offered), "its own")
 
     def made(self) -> Robot:
         """The robot, on its engine."""

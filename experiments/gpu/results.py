@@ -32,8 +32,8 @@ class Results:
       directory: where both files lie.
     """
 
-    def __init__(self, directory: Path):
-        self.path = directory / "gpu.json"
+    def __init__(self, directory: Path | str):
+        self.path = Path(directory) / "gpu.json"
 
     def begin(self, machine: str, call: Row) -> None:
         """Says on which machine the rows to come are measured, and how."""

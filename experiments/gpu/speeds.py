@@ -25,8 +25,8 @@ from genidm.paper.methods import LR
 from genidm.paper.replaying import Runner
 from genidm.robots import Robot, State
 
-# Engine → numbers of lanes. Others, of a robot that steps itself, are measured as MuJoCo in C.
-LANES = {"mjx": (128, 512, 2048, 8192), "mujoco": (128, 512)}
+# Numbers of lanes, for engines of an accelerator and for others.
+LANES, FEW_LANES = (128, 512, 2048, 8192), (128, 512)
 # Steps of a lane in a call.
 STEPS = 32
 # Calls of which the median is taken: at least three, and more for so many seconds.
@@ -159,7 +159,8 @@ class Measuring:
     def run(self) -> bool:
         """Measures what is not known; whether nothing is left out for want of time."""
         devices, took = self._robot.mesh().size, 0.0
-        for asked in LANES.get(self._engine, LANES["mujoco"]):
+        engine = self._robot.engine
+        for asked in LANES if engine and engine.on_accelerator else FEW_LANES:
             lanes = -(-asked // devices) * devices  # as many as they can share evenly
             todo = [what for what in PROBES if self._wanted(self._names(what, lanes))]
             if todo and self._end - time.monotonic() < took:

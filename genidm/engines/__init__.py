@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Collection
+from typing import Any, TypeVar
 
 import mujoco
 
-from genidm import devices
+from genidm import devices, registry
 from genidm.engines.base import Engine, Physics, Stepped
 from genidm.engines.mjx import MJX
 from genidm.engines.mujoco import MuJoCo
@@ -17,7 +17,29 @@ from genidm.errors import BadInput
 ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (MJX, MuJoCo)}
 
 
-def choose(name: str | None, offered: Sequence[str], robot: str) -> str:
+E = TypeVar("E", bound=type[Engine])
+
+
+def register(kind: E) -> E:
+    """Makes an engine known by its name: to every robot with a MuJoCo model, and to `--engine`.
+
+    It is a class decorator, for engines outside of genidm; genidm's own stand in `ENGINES`.
+    Without `--engine` an engine that stands further up is chosen.
+
+    Args:
+      kind: the class, which is made as `kind(spec, frame_skip)`. It may be registered again.
+
+    Returns:
+      the class.
+
+    Raises:
+      BadInput: a method of the contract is missing, or another engine has this name.
+    """
+    registry.add(ENGINES, kind, "engine")
+    return kind
+
+
+def choose(name: str | None, offered: Collection[str], robot: str) -> str:
     """The engine to step a robot with.
 
     Args:
@@ -50,4 +72,4 @@ def of_model(name: str, spec: mujoco.MjSpec, frame_skip: int) -> Engine:
     return kind(spec, frame_skip)
 
 
-__all__ = ["ENGINES", "Engine", "Physics", "Stepped", "choose", "of_model"]
+__all__ = ["ENGINES", "Engine", "Physics", "Stepped", "choose", "of_model", "register"]

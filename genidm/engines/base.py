@@ -5,7 +5,7 @@ nothing is kept between two steps. So any state can be set, lanes can be refille
 be replayed (𝒢), and a run that was killed goes on with the same bits.
 
 To add an engine (MuJoCo Warp, say), write one file with a subclass of `Engine`, and name it in
-`genidm.engines.ENGINES`. It has to do five things:
+`genidm.engines.ENGINES`; docs/extending.md shows one. It has to do five things:
 
 1. `__init__(spec, frame_skip)`: take a MuJoCo model and the number of physics steps in a control
    step. `Physics` is what it is given and gives back.
@@ -67,6 +67,7 @@ class Engine(abc.ABC):
 
     Attributes:
       name: as `--engine` takes it.
+      label: what tables call it, with the precision of its rows.
       on_accelerator: whether it is the one to choose where jax has an accelerator.
       segment: control steps that a turned replay stays within millimetres of the record for
         (docs/physics.md): the segments of 𝒢, unless the user gives their length.
@@ -75,6 +76,7 @@ class Engine(abc.ABC):
     """
 
     name: ClassVar[str]
+    label: ClassVar[str]
     on_accelerator: ClassVar[bool] = False
     one_device: ClassVar[bool] = True
     segment: ClassVar[int] = 20

@@ -30,6 +30,7 @@ class Bullet(Engine):
     """
 
     name = "bullet"
+    label = "Bullet float32 rows"
 
     def __init__(self, command: Sequence[str], width: int, processes: int | None, patience: float):
         self.width = width

@@ -20,6 +20,7 @@ class MJX(Engine):
     """
 
     name = "mjx"
+    label = "MJX float32"
     on_accelerator = True
     one_device = False
 

@@ -37,6 +37,7 @@ class MuJoCo(Engine):
     """
 
     name = "mujoco"
+    label = "C float32 rows"
     segment = 50
 
     def __init__(self, spec: mujoco.MjSpec, frame_skip: int, threads: int | None = None):

@@ -130,6 +130,11 @@ class Pool:
         for _ in range(self.workers):
             self._idle.put(None)
 
+    @property
+    def processes(self) -> list[int]:
+        """Process ids of the workers that have started and wait for rows."""
+        return [worker.process.pid for worker in list(self._idle.queue) if worker]
+
     def greeting(self) -> np.ndarray:
         """What workers say first, `[out]`."""
         worker = self._idle.get()

@@ -152,7 +152,19 @@ def generalize(
     look_ahead: int = 100,
     mirror: bool = False,
 ) -> tuple[Pairs, dict[str, np.ndarray]]:
-    """𝒢 from record to Pairs, and the e.m.o. residual; `replay` and `pairs` in one."""
+    """𝒢 from record to Pairs, and the e.m.o. residual; `replay` and `pairs` in one.
+
+    Args:
+      robot: the robot that the record is of.
+      experience: E, `[T, B, ...]`.
+      key: of the yaws.
+      settings: of 𝒢.
+      look_ahead: h, steps to the intermediate goal o'.
+      mirror: adds the reflection of every sample; not in the paper.
+
+    Returns:
+      the samples, and the residual as `residual` gives it, in metres.
+    """
     turned = replay(robot, experience, key, settings)
     samples = pairs(robot, experience, turned, look_ahead=look_ahead, mirror=mirror)
     return samples, residual(experience, turned)

@@ -1,8 +1,9 @@
 """Robots behind one contract (`genidm.robots.base.Robot`)."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
+from genidm import registry
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
 from genidm.robots.base import Robot, State
@@ -13,6 +14,27 @@ from genidm.robots.minitaur import Minitaur
 ROBOTS: dict[str, type[Robot]] = {
     robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld, Minitaur)
 }
+
+
+R = TypeVar("R", bound=type[Robot])
+
+
+def register(kind: R) -> R:
+    """Makes a robot known by its name: to `--robot`, and to `load` of its controllers.
+
+    It is a class decorator, for robots outside of genidm; genidm's own stand in `ROBOTS`.
+
+    Args:
+      kind: the class. It may be registered again, as a notebook does that runs a cell twice.
+
+    Returns:
+      the class.
+
+    Raises:
+      BadInput: a method of the contract is missing, or another robot has this name.
+    """
+    registry.add(ROBOTS, kind, "robot")
+    return kind
 
 
 def by_name(name: str, engine: str | None = None) -> Robot:
@@ -28,6 +50,8 @@ def by_name(name: str, engine: str | None = None) -> Robot:
     if name not in ROBOTS:
         raise BadInput(f"no robot is called {name!r}; there are: {', '.join(ROBOTS)}")
     kind: Any = ROBOTS[name]
+    if engine is not None and not kind.engines:
+        raise BadInput(f"the {name} steps itself: it takes no engine {engine!r}")
     return kind() if engine is None else kind(engine=engine)
 
 
@@ -67,5 +91,6 @@ __all__ = [
     "Robot",
     "State",
     "by_name",
+    "register",
     "remade",
 ]

@@ -9,7 +9,7 @@ import numpy as np
 from genidm import symmetry
 from genidm.engines.base import Physics
 from genidm.robots.base import State
-from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver, load
+from genidm.robots.mujoco import ASSETS, MujocoRobot
 from genidm.symmetry import Layout
 
 # Metres; what the reset noise can lower a foot by (0.1 of height, 0.1 rad at the ankle).
@@ -27,10 +27,12 @@ class Ant(MujocoRobot):
 
     Args:
       solver: of the contacts.
-      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
+      engine: one of `engines`; chosen by what jax runs on, unless given.
     """
 
     name = "ant"
+    model = ASSETS / "ant.xml"
+    frames = 5
     control_step = 0.05
     standing_height = 0.55
     target_distance = (2.0, 5.0)
@@ -41,23 +43,6 @@ class Ant(MujocoRobot):
     control_cost = 0.5
     contact_cost = 5e-4
 
-    def __init__(self, solver: Solver | None = None, engine: str | None = None):
-        solver = solver or Solver()
-        super().__init__(load(ASSETS / "ant.xml", solver), 5, engine)
-        self.settings |= {"solver": solver}
-        m = self.mirror
-        self.observation = Layout(
-            (
-                symmetry.invariant("height", unit="m"),
-                symmetry.quaternion("orientation"),
-                symmetry.joints("joint angles", m.hinges, m.signs, "rad"),
-                symmetry.vector("velocity", "m/s"),
-                symmetry.body_pseudovector("spin"),
-                symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s"),
-                symmetry.wrenches("contact", m.bodies),
-            )
-        )
-
     def rest_pose(self) -> np.ndarray:
         pose = self.mj_model.numeric("init_qpos").data.astype(np.float32)
         # There the feet just touch the floor: noise would put some of them inside it, and the
@@ -65,15 +50,17 @@ class Ant(MujocoRobot):
         pose[2] += START_CLEARANCE
         return pose
 
+    def _layout(self) -> Layout:
+        contact = symmetry.wrenches("contact", self.mirror.bodies)
+        return Layout((*super()._layout().fields, contact))
+
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
-        qpos = physics.qpos.at[3:7].set(symmetry.positive(physics.qpos[3:7]))
         wrenches = clip_wrenches(contact).reshape(-1)
-        return jnp.concatenate([qpos[2:], physics.qvel, wrenches])
+        return jnp.concatenate([super()._observe(physics, contact), wrenches])
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         contact = self.observation.part(state.observation, "contact")
-        control = self.control_cost * jnp.sum(action**2, axis=-1)
-        return control + self.contact_cost * jnp.sum(contact**2, axis=-1)
+        return super().cost(state, action) + self.contact_cost * jnp.sum(contact**2, axis=-1)
 
 
 def clip_wrenches(wrenches: jax.Array) -> jax.Array:

@@ -7,6 +7,7 @@ state out, so the caller may jit, scan, shard or replay it at will.
 from __future__ import annotations
 
 import abc
+from collections.abc import Collection
 from typing import Any, ClassVar
 
 import flax.struct
@@ -46,6 +47,9 @@ class State(flax.struct.PyTreeNode):
 class Robot(abc.ABC):
     """What can be walked.
 
+    A robot is made without arguments, and takes `engine=` if it has `engines`
+    (`genidm.robots.by_name`).
+
     Attributes:
       name: lower case, as it stands in paths and on the command line.
       observation: layout of s `[S]`.
@@ -68,7 +72,7 @@ class Robot(abc.ABC):
     target_distance: ClassVar[tuple[float, float]]
     alive_bonus: ClassVar[float]
     paper_interactions: ClassVar[int]
-    engines: ClassVar[tuple[str, ...]] = ()
+    engines: ClassVar[Collection[str]] = ()
     engine: Engine | None = None
     settings: dict[str, Any]
     observation: Layout

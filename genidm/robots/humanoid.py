@@ -13,7 +13,7 @@ import numpy as np
 from genidm import symmetry
 from genidm.engines.base import Physics
 from genidm.robots.base import State
-from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver, load
+from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver
 from genidm.symmetry import Layout
 
 Frame = Literal["heading", "world"]
@@ -48,7 +48,7 @@ class Humanoid(MujocoRobot):
 
     Args:
       solver: of the contacts.
-      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
+      engine: one of `engines`; chosen by what jax runs on, unless given.
 
     Attributes:
       velocity: its frame in s. PyBullet turns it by the yaw, which takes from the LFM some of
@@ -57,6 +57,8 @@ class Humanoid(MujocoRobot):
 
     name = "humanoid"
     velocity: ClassVar[Frame] = "heading"
+    model = ASSETS / "humanoid.xml"
+    frames = 4
     control_step = 0.0165
     standing_height = 1.17
     target_distance = (2.0, 5.0)
@@ -69,16 +71,19 @@ class Humanoid(MujocoRobot):
     limit_cost = 0.1
 
     def __init__(self, solver: Solver | None = None, engine: str | None = None):
-        solver = solver or Solver()
-        super().__init__(edited(load(ASSETS / "humanoid.xml", solver)), 4, engine)
-        self.settings |= {"solver": solver}
+        super().__init__(solver, engine)
         limits = self.mj_model.jnt_range[1:]
         self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])
+
+    def _specify(self, solver: Solver) -> mujoco.MjSpec:
+        return edited(super()._specify(solver))
+
+    def _layout(self) -> Layout:
         m = self.mirror
         motion = symmetry.heading_vector if self.velocity == "heading" else symmetry.vector
         angle_and_rate = [2 * hinge + i for hinge in m.hinges for i in (0, 1)]
-        self.observation = Layout(
+        return Layout(
             (
                 symmetry.invariant("height", unit="m above 0.8"),
                 motion("velocity", "m/s × 0.3"),
@@ -133,7 +138,7 @@ class HumanoidWorld(Humanoid):
 
 def edited(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Brax's humanoid with PyBullet's motors, limits, time step and base; both sides alike."""
-    spec.option.timestep = Humanoid.control_step / 4
+    spec.option.timestep = Humanoid.control_step / Humanoid.frames
     for side in ("right", "left"):
         spec.joint(f"{side}_hip_y").range = HIP_RANGE
         spec.joint(f"{side}_hip_y").armature = HIP_ARMATURE

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+from os import PathLike
+from typing import ClassVar
 
 import brax
 import jax
@@ -13,7 +16,7 @@ import numpy as np
 from etils import epath
 
 from genidm import engines, symmetry
-from genidm.engines.base import Engine, Physics
+from genidm.engines import ENGINES, Engine, Physics
 from genidm.robots.base import Robot, State, select
 from genidm.symmetry import Layout
 
@@ -36,8 +39,8 @@ class Solver:
     elliptic: bool = True
 
 
-def load(path: epath.Path, solver: Solver) -> mujoco.MjSpec:
-    """A model file with the solver settings put in."""
+def load(path: PathLike[str] | str, solver: Solver) -> mujoco.MjSpec:
+    """A model file (MJCF) with the solver settings put in."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = solver.iterations
@@ -100,41 +103,79 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
 
 
 class MujocoRobot(Robot):
-    """A robot with a free base on hinges, stepped by MJX or by MuJoCo in C.
+    """A robot with a free base on hinges, stepped by an engine of `genidm.engines.ENGINES`.
 
-    Subclasses name the constants of the contract and `healthy_height`, and give
-    `_observe` and `cost`.
+    A subclass sets `name`, `model`, `frames`, `control_step`, `standing_height` and
+    `healthy_height`; docs/extending.md shows one. It overrides the rest where it differs.
+
+    By default s is gymnasium's without x and y: height, quaternion (w ≥ 0), joint angles,
+    velocity, spin, joint velocities.
 
     Args:
-      spec: the model.
+      solver: of the contacts.
+      engine: one of `engines`; chosen by what jax runs on, unless given.
+
+    Attributes:
+      model: the MJCF file.
       frames: physics steps a control step.
-      engine: "mjx" or "mujoco"; chosen by what jax runs on, unless given.
+      healthy_height: metres, least and greatest height of the base; outside, the robot has fallen.
+      control_cost: cost of a step, times the sum of the squared actions.
+      reset_noise: of a start: ± m, ± rad; m/s, rad/s (standard deviation).
+
+    Raises:
+      ValueError: the model has no free base, has joints that are no hinges, is not its own mirror
+        image, or its time step does not fit `control_step`.
     """
 
-    engines = ("mjx", "mujoco")
+    engines = ENGINES.keys()
     engine: Engine
-    healthy_height: tuple[float, float]
+    model: ClassVar[PathLike[str] | str]
+    frames: ClassVar[int]
+    healthy_height: ClassVar[tuple[float, float]]
+    target_distance = (2.0, 5.0)
+    alive_bonus = 1.0
+    paper_interactions = 2_000_000
+    control_cost: float = 0.5
     reset_noise: float = 0.1
 
-    def __init__(self, spec: mujoco.MjSpec, frames: int, engine: str | None):
-        self._spec = spec
-        self.mj_model = spec.compile()
-        self.frames = frames
-        self.engine = engines.of_model(
-            engines.choose(engine, self.engines, self.name), spec, frames
-        )
-        self.settings = {"name": self.name, "engine": self.engine.name}
+    def __init__(self, solver: Solver | None = None, engine: str | None = None):
+        solver = solver or Solver()
+        self._spec = self._specify(solver)
+        self.mj_model = self._spec.compile()
+        _fitting(self.mj_model, self.frames, self.control_step)
+        chosen = engines.choose(engine, self.engines, self.name)
+        self.engine = engines.of_model(chosen, self._spec, self.frames)
+        self.settings = {"name": self.name, "engine": self.engine.name, "solver": solver}
         self._rest = self.rest_pose()
         self.mirror = mirror_of(self.mj_model)
         self.physics = self._physics_layout()
+        self.observation = self._layout()
         m = self.mirror
         self.action = Layout(
             (symmetry.joints("torque", m.actuators, m.actuator_signs, "of full torque"),)
         )
 
+    def _specify(self, solver: Solver) -> mujoco.MjSpec:
+        """The model with the solver settings."""
+        return load(self.model, solver)
+
     def rest_pose(self) -> np.ndarray:
         """qpos `[nq]` that resets are drawn around."""
         return self.mj_model.qpos0.astype(np.float32)
+
+    def _layout(self) -> Layout:
+        """Layout of s, which `_observe` fills."""
+        m = self.mirror
+        return Layout(
+            (
+                symmetry.invariant("height", unit="m"),
+                symmetry.quaternion("orientation"),
+                symmetry.joints("joint angles", m.hinges, m.signs, "rad"),
+                symmetry.vector("velocity", "m/s"),
+                symmetry.body_pseudovector("spin"),
+                symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s"),
+            )
+        )
 
     def _physics_layout(self) -> Physics:
         m = self.mirror
@@ -198,4 +239,18 @@ class MujocoRobot(Robot):
 
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         """s `[S]` of one robot from its physics and contact wrenches `[nbody, 6]`."""
-        raise NotImplementedError
+        qpos = physics.qpos.at[3:7].set(symmetry.positive(physics.qpos[3:7]))
+        return jnp.concatenate([qpos[2:], physics.qvel])
+
+    def cost(self, state: State, action: jax.Array) -> jax.Array:
+        return self.control_cost * jnp.sum(action**2, axis=-1)
+
+
+def _fitting(model: mujoco.MjModel, frames: int, control_step: float) -> None:
+    """Refuses a model that `Physics` does not describe, or that is stepped at another rate."""
+    free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
+    if [*model.jnt_type[:1]] != [free] or not (model.jnt_type[1:] == hinge).all():
+        raise ValueError("the model is to have a free joint first, and hinges after it")
+    made = frames * model.opt.timestep
+    if not math.isclose(made, control_step, rel_tol=1e-6):
+        raise ValueError(f"{frames} time steps of the model are {made:g} s, not {control_step:g} s")
