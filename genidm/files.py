@@ -133,6 +133,21 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def writable(path: Path | str) -> None:
+    """Refuses a file that cannot be written, and makes its directory: asked before the work.
+
+    Raises:
+      BadInput: why it cannot be. A disk that is full by then is said when it is written.
+    """
+    path = Path(path)
+    with disk(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        scratch = _scratch(path, "new")
+        scratch.touch()
+        scratch.unlink()
+
+
 def save_text(path: Path | str, text: str) -> None:
     """Writes a text file."""
     save_bytes(path, text.encode())

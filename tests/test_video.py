@@ -6,6 +6,7 @@ import dataclasses
 import html
 import io
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -21,9 +22,10 @@ from tiny import TEST, tiny
 from genidm import robots, video
 from genidm.config import plain
 from genidm.errors import BadInput
+from genidm.evaluation.evaluate import Test
 from genidm.evaluation.scenarios import scenarios
 from genidm.evaluation.waypoints import Follow
-from genidm.files import load_arrays, save_json
+from genidm.files import Torn, load_arrays, save_arrays, save_json
 from genidm.paper import methods
 from genidm.robots import Ant, HumanoidWorld, Logged, remade
 from genidm.robots.mujoco import Solver
@@ -131,13 +133,15 @@ def test_a_robot_without_a_drawing_is_refused(robot) -> None:
 
 def test_numbers_that_cannot_be_are_refused() -> None:
     refused: list[tuple[dict, str]] = [
-        ({"episodes": ()}, "at least one"), ({"episodes": (1, -1)}, "0, 1, 2"),
+        ({"episodes": ()}, "at least one"), ({"episodes": (1, -1)}, "episode must be at least 0"),
+        ({"episodes": (10**12,)}, "at most 999999"), ({"episodes": (0.5,)}, "whole number"),
+        ({"seed": -1}, "seed"), ({"seed": 2**32}, "seed"),
         ({"seconds": 0.01}, "at least 0.05 s"), ({"seconds": np.nan}, "at least 0.05 s"),
     ]  # fmt: skip
     for wrong, said in refused:
         with pytest.raises(BadInput, match=said):
             video.film_test(Drawn(), straight(Drawn()), **wrong)
-    for wrong in ({"fps": 0.0}, {"width": 2}, {"hold": -1.0}):
+    for wrong in ({"fps": 0.0}, {"fps": 1e-3}, {"width": 2}, {"hold": -1.0}):
         with pytest.raises(BadInput, match=next(iter(wrong))):
             Shot(**wrong)
 
@@ -225,15 +229,18 @@ def test_every_kind_of_geom_is_shown_and_a_mesh_as_its_box() -> None:
     for kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_ELLIPSOID):
         arm.add_geom(type=kind, size=(0.1, 0.2, 0.3), rgba=(1, 0, 0, 1))
     arm.add_geom(type=kinds.mjGEOM_MESH, meshname="wedge", pos=(0.1, 0.2, 0.3))
+    spec.add_material(name="paint", rgba=(0, 0, 1, 1))
+    arm.add_geom(type=kinds.mjGEOM_SPHERE, size=(0.1, 0, 0), material="paint")
     arm.add_geom(type=kinds.mjGEOM_BOX, size=(1, 1, 1), group=3)
     arm.add_geom(type=kinds.mjGEOM_BOX, size=(1, 1, 1), rgba=(1, 0, 0, 0))
     qpos = np.array([[0.0, 0, 0, 1, 0, 0, 0, 0]] * 2)
     take = Take(qpos, qpos[:, :3], np.zeros((1, 3)), np.array([1]), False, 0.1)
     page = contents(Film("all", spec, [take], 0.1))
     shown = [geom["kind"] for geom in page["geoms"]]
-    assert shown == ["box", "capsule", "sphere", "cylinder", "ellipsoid", "box"]
+    assert shown == ["box", "capsule", "sphere", "cylinder", "ellipsoid", "box", "sphere"]
     assert page["geoms"][2]["colour"] == [255, 0, 0]
-    box = page["geoms"][-1]
+    assert page["geoms"][-1]["colour"] == [0, 0, 255]
+    box = page["geoms"][-2]
     # The body's frame is turned by nothing here, so the corners are where the file has them.
     turned = np.zeros(9)
     mujoco.mju_quat2Mat(turned, np.array(box["turn"]))
@@ -309,6 +316,13 @@ def test_a_gif_has_every_picture_for_its_time(made: Film, tmp_path: Path) -> Non
         assert {frame_time(gif, i) for i in range(gif.n_frames)} == {80}
 
 
+@pytest.mark.parametrize("fps", [0.01, 0.5, 10.0, 25.0, clip.FASTEST])
+def test_a_gif_is_shown_at_its_pace(fps: float) -> None:
+    pictures = [np.full((16, 16, 3), x, np.uint8) for x in (0, 255)]
+    with Image.open(io.BytesIO(clip.gif(pictures, fps))) as gif:
+        assert frame_time(gif, 1) == pytest.approx(1000 / fps)
+
+
 def frame_time(gif: Image.Image, number: int) -> int:
     gif.seek(number)
     return gif.info["duration"]
@@ -342,14 +356,31 @@ def test_mp4_needs_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
         clip.encoder()
 
 
-def test_an_mp4_has_every_picture(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("shape", "size"), [((64, 96), (96, 64)), ((63, 95), (96, 64))])
+def test_an_mp4_has_every_picture(
+    shape: tuple[int, int], size: tuple[int, int], tmp_path: Path
+) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="mp4 needs imageio-ffmpeg")
-    pictures = [np.full((64, 96, 3), 25 * i, np.uint8) for i in range(10)]
+    pictures = (np.full((*shape, 3), 25 * i, np.uint8) for i in range(10))
     (tmp_path / "a.mp4").write_bytes(clip.mp4(pictures, 5.0))
-    assert ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4")) == (
-        10,
-        pytest.approx(2.0, abs=0.1),
-    )
+    about, *shown = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
+    assert about["size"] == size and about["fps"] == 5.0 and about["pix_fmt"].startswith("yuv420p")
+    middle = [np.frombuffer(x, np.uint8).reshape(*size[::-1], 3)[32, 48].mean() for x in shown]
+    assert middle == pytest.approx([25 * i for i in range(10)], abs=4)
+
+
+@pytest.mark.parametrize("reads", ["cat > /dev/null", "true"])
+def test_an_mp4_that_cannot_be_encoded_is_refused(
+    reads: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where that shows at the very end: the last bytes are written there."""
+    fails = tmp_path / "ffmpeg"
+    fails.write_text(f"#!/bin/sh\n{reads}\necho No space left on device >&2\nexit 1\n")
+    fails.chmod(0o755)
+    monkeypatch.setattr(clip, "encoder", lambda: str(fails))
+    pictures = [np.zeros((640, 480, 3), np.uint8)] * 3
+    with pytest.raises(BadInput, match=r"cannot encode the mp4 in /.*: No space left on device$"):
+        clip.mp4(pictures, 5.0)
 
 
 # ── what it draws with ──────────────────────────────────────────────────────────────────
@@ -391,9 +422,57 @@ def test_what_does_not_start_is_not_taken() -> None:
     assert not backends.starts("nothing_of_that_name")
 
 
-def test_a_film_is_one_of_three_kinds(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match=r"a \.gif, an \.mp4 or a page"):
-        video.check(tmp_path / "film.avi")
+REFUSED: list[tuple[str, dict, str]] = [
+    ("film.avi", {}, r"a \.gif, an \.mp4 or a page"),
+    ("film", {}, r"a \.gif, an \.mp4 or a page"),
+    ("a.gif", {"fps": math.nan}, "fps must be a finite number"),
+    ("a.gif", {"fps": 60.0}, r"fps of a gif must lie in .*50"),
+    ("a.mp4", {"fps": 1e-9}, "fps must lie in"),
+    ("a.html", {"fps": math.inf}, "fps must be a finite number"),
+    ("a.mp4", {"width": 10**6}, "width must be at most 8192"),
+    ("a.gif", {"height": -3}, "height must be at least 16"),
+    ("file/a.gif", {}, "cannot use .*file/a.gif"),
+    ("folder.html", {}, "folder.html: Is a directory"),
+    (f"{'x' * 300}.mp4", {}, "File name too long"),
+    ("proc/a.html", {}, "cannot use"),
+]
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Path:
+    """A directory with a file, a directory called like a film, and one that nobody can write."""
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "proc").symlink_to("/proc")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "changes", "said"), REFUSED)
+def test_what_cannot_be_written_is_refused_before_there_is_a_film(
+    name: str, changes: dict, said: str, places: Path
+) -> None:
+    with pytest.raises(BadInput, match=said):
+        video.check(places / name, **changes)
+    # Were the run looked at before the film's file, it would say that there is no such run.
+    with pytest.raises(BadInput, match=said):
+        main((places / "no run",), (places / "good.html", places / name), **changes)
+    assert not (places / "good.html").exists()
+
+
+def test_checking_leaves_no_file(tmp_path: Path) -> None:
+    shot = video.check(str(tmp_path / "new" / "a.html"), width=99)
+    assert shot.width == 99 and [p.name for p in tmp_path.rglob("*")] == ["new"]
+
+
+def test_a_command_refuses_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    out = str(tmp_path / "a.html")
+    monkeypatch.setattr(sys, "argv", ["video", str(tmp_path), "--out", out, "--fps", "nan"])
+    with pytest.raises(SystemExit) as stop:
+        guarded(main, "Films a saved controller.")
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and said == "error: fps must be a finite number, not nan\n"
 
 
 # ── from a command ──────────────────────────────────────────────────────────────────────
@@ -412,9 +491,15 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     takes = video.film_tested(Drawn(), test).takes
     assert [len(take.qpos) - 1 for take in takes] == outcome["steps"][0].tolist()
     assert [take.fell for take in takes] == outcome["fell"][0].tolist()
-    assert contents(video.film_tested(Drawn(), test, title="RS, point")) == beside
+    assert contents(video.film_tested(Drawn(), str(test), title="RS, point")) == beside
     assert recorded(path.parent, Drawn(), (0, 1)) == test
-    assert recorded(path.parent, Drawn(), (2,)) is None
+    assert recorded(str(path.parent), Drawn(), (2,)) is None
+    assert contents(video.film_run(str(path.parent), robot=Drawn())) == beside
+    save_json(tmp_path / "point" / "test-of-others" / "done.json", [])  # the newest, and no test's
+    assert recorded(path.parent, Drawn()) == test
+    for other in ("test-of-others", "no run", *(p.name for p in tmp_path.glob("point/exp*"))):
+        with pytest.raises(BadInput, match=r"done\.json|controller"):
+            video.film_run(tmp_path / "point" / other, robot=Drawn())
     assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
     main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)
@@ -425,6 +510,33 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     way = inside((tmp_path / "way.html").read_text())
     assert [take["waypoints"] for take in way["takes"]] == [[[9, 0, 0.5], [0, 9, 0.5]]] * 2
     assert way["reach"] == Follow.reach and "way.html" in capsys.readouterr().out
+
+
+def test_a_test_is_read_by_the_film_alone_which_sees_whether_it_is_torn(tmp_path: Path) -> None:
+    run, test = tmp_path / "RS-0-a", tmp_path / "test-RS-0-b"
+    poses = np.array([[0.0, 0, 0, 1, 0, 0, 0, 0]] * 3)
+    recording = {"qpos": poses, "position": poses[:, :3], "target": np.zeros(3)}
+    outcome = {"reached": np.array([[False, True]]), "fell": np.array([[True, False]])}
+    tree = {"episodes": outcome, "recordings": {"1": recording}}
+    save_arrays(test / "episodes", tree, {})
+    Stage(test).finish({"fit": run.name, "engine": None, "test": plain(Test(max_steps=9))})
+    assert recorded(run, Drawn(), [1]) == recorded(str(run), Drawn()) == test
+    assert recorded(run, Drawn(), [0, 1]) is None
+    (take,) = video.film_tested(Drawn(), str(test)).takes
+    assert take.arrival.tolist() == [2] and not take.fell
+    with pytest.raises(BadInput, match="no recording of episode 0"):
+        video.film_tested(Drawn(), test, [1, 0])
+    (test / "episodes" / "recordings.1.qpos.npy").write_bytes(b"torn")
+    assert recorded(run, Drawn()) == test
+    with pytest.raises(Torn, match=r"recordings\.1\.qpos"):
+        video.film_tested(Drawn(), test)
+
+
+def test_a_test_that_has_recorded_nothing_is_no_film(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "episodes", {"episodes": {"fell": np.zeros((1, 1), bool)}}, {})
+    Stage(tmp_path).finish({"test": plain(Test())})
+    with pytest.raises(BadInput, match="no recording"):
+        video.film_tested(Drawn(), tmp_path)
 
 
 def test_a_cell_that_cannot_be_filmed_says_so_before_it_begins(tmp_path: Path) -> None:

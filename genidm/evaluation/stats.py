@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from genidm.evaluation.episodes import Episodes
 
@@ -21,7 +22,7 @@ Array = np.ndarray
 
 THRESHOLDS = (0.25, 0.5, 1.0)  # metres; an episode that came this near is a success
 RESAMPLES = 10_000  # of each bootstrap
-_BLOCK = 1_000  # resamples drawn at once, which bounds the memory
+_BATCH = 1_000  # resamples drawn at once, which bounds the memory
 _SEED = 0  # of the bootstrap's generator: the same episodes give the same interval
 _FEWEST = 3  # training seeds that an interval is made from
 
@@ -145,18 +146,20 @@ def interval(values: Array) -> tuple[float, float]:
     """
     rows = [row[np.isfinite(row)] for row in np.asarray(values, float)]
     rows = [row for row in rows if row.size]
-    if not rows:
-        return float("nan"), float("nan")
-    units = np.array([row.mean() for row in rows]) if len(rows) > 1 else rows[0]
-    low, high = np.percentile(_resampled_means(units), [2.5, 97.5])
+    units = np.array([row.mean() for row in rows]) if len(rows) != 1 else rows[0]
+    if units.size < 2:  # SciPy refuses to resample one number, or none
+        return _mean(units), _mean(units)
+    low, high = scipy.stats.bootstrap(
+        (units,), np.mean, n_resamples=RESAMPLES, batch=_BATCH, confidence_level=0.95,
+        method="percentile", rng=np.random.default_rng(_SEED),
+    ).confidence_interval  # fmt: skip
     return float(low), float(high)
 
 
 def interquartile_mean(values: Array) -> float:
     """Mean of the middle half of `values`, NaN left out: the least and greatest quarter go."""
-    ordered = np.sort(values[np.isfinite(values)])
-    cut = ordered.size // 4
-    return _mean(ordered[cut : ordered.size - cut])
+    kept = values[np.isfinite(values)]
+    return float(scipy.stats.trim_mean(kept, 0.25)) if kept.size else float("nan")
 
 
 def masked(episodes: Episodes) -> Array:
@@ -193,12 +196,6 @@ def _check_same_scenarios(a: Episodes, b: Episodes) -> None:
     # what another scenario does.
     if not np.allclose(a.start[both], b.start[both], rtol=0, atol=1e-3):
         raise ValueError("not the same scenarios: the distances at the start differ")
-
-
-def _resampled_means(units: Array) -> Array:
-    rng, n = np.random.default_rng(_SEED), units.size
-    blocks = range(RESAMPLES // _BLOCK)
-    return np.concatenate([units[rng.integers(n, size=(_BLOCK, n))].mean(1) for _ in blocks])
 
 
 def _spread(means: Sequence[float]) -> dict[str, Any]:

@@ -100,13 +100,7 @@ def film_cell(this: Cell[Any]) -> None:
     from genidm import video  # nor is this
 
     stage = this.controller_stage
-    title = f"{this.method.name}, {this.robot.name}"
-    test = video.recorded(stage.directory, this.robot)
-    made = (
-        video.film_tested(this.robot, test, title=title)
-        if test
-        else video.film_test(this.robot, this.controller(), title=title)
-    )
+    made = video.film_run(stage.directory, robot=this.robot)
     video.write(made, stage.path("video.html"))
     try:
         video.write(made, stage.path("video.gif"))

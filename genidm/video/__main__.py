@@ -53,10 +53,10 @@ def main(
         raise BadInput(f"a film is of one run, not of {', '.join(map(str, runs)) or 'none'}")
     (run,) = runs
     paths = out or (Path("runs/video") / f"{run.resolve().parent.name}-{run.resolve().name}.gif",)
-    for path in paths:
-        video.check(path)
     given = {"width": width, "height": height, "fps": fps}
     changes: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
+    for path in paths:
+        video.check(path, **changes)
     points = in_twos(waypoints) if waypoints else None
     made = video.film_run(run, episodes, points, seed, seconds, reach, engine)
     for path in paths:

@@ -1,8 +1,7 @@
 """What MuJoCo draws with: EGL on a GPU, OSMesa in software, as the machine has it.
 
 PyOpenGL binds itself to one of them for the life of a process, so each is tried in a process
-of its own, and only the one that starts is imported here. `mujoco.Renderer` is not used: it
-is bound when mujoco is imported, long before anybody asks for a picture.
+of its own, and only the one that starts is imported here.
 """
 
 from __future__ import annotations
@@ -13,7 +12,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+
+import mujoco
+from mujoco.rendering.classic import gl_context
 
 from genidm.errors import BadInput
 
@@ -23,24 +24,20 @@ NAMED = ("egl", "osmesa", "glfw", "cgl")
 OFF = ("disable", "disabled", "off", "false", "0")
 GPU = ("nvidia[0-9]*", "dri/renderD*")
 
-_TRIAL = """
-import importlib, mujoco, sys
-context = importlib.import_module("mujoco." + sys.argv[1]).GLContext(8, 8)
-context.make_current()
-mujoco.MjrContext(mujoco.MjSpec().compile(), 100).free()
-context.free()
-"""
+_TRIAL = "import mujoco; mujoco.Renderer(mujoco.MjSpec().compile(), 8, 8).close()"
 # A machine that is busy compiles Mesa's shaders for a while.
 PATIENCE = 120.0
 
 
-def context(width: int, height: int) -> Any:
-    """A GL context to draw pictures of up to this size in; `free` it.
+def renderer(model: mujoco.MjModel, width: int, height: int, most: int) -> mujoco.Renderer:
+    """MuJoCo's renderer, a context manager, for pictures of a size and so many things in them.
 
     Raises:
       BadInput: there is nothing to draw with.
     """
-    return importlib.import_module(f"mujoco.{backend()}").GLContext(width, height)
+    # MuJoCo chooses when it is imported, by MUJOCO_GL alone, and by none takes a window's.
+    gl_context.GLContext = importlib.import_module(f"mujoco.{backend()}").GLContext
+    return mujoco.Renderer(model, height, width, most)
 
 
 @functools.cache
@@ -76,8 +73,9 @@ def candidates() -> tuple[str, ...]:
 
 def starts(name: str) -> bool:
     """Whether a backend draws, in a process of its own."""
-    command = [sys.executable, "-c", _TRIAL, name]
+    command, chosen = [sys.executable, "-c", _TRIAL], {**os.environ, "MUJOCO_GL": name}
     try:
-        return not subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode
+        trial = subprocess.run(command, env=chosen, capture_output=True, timeout=PATIENCE)
+        return trial.returncode == 0
     except subprocess.TimeoutExpired:
         return False

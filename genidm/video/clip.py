@@ -1,38 +1,44 @@
-"""Films as files: gif by Pillow, mp4 by imageio-ffmpeg."""
+"""Films as files: gif by Pillow, mp4 by the ffmpeg that comes with imageio-ffmpeg."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
+import itertools
+import subprocess
 import tempfile
-import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from genidm.errors import BadInput
 
+FASTEST = 50.0  # pictures a second of a gif: browsers slow down what is shown for less than 0.02 s
 # Of all pictures together: few colours, and the same ones, are what keeps a gif small.
 COLOURS = 64
 SAMPLED = 24
+RAW = "-v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
+# Players take whole pairs of pixels alone.
+H264 = "-c:v h264 -crf 25 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
 
 
-def gif(pictures: Sequence[np.ndarray], fps: float) -> bytes:
+def gif(pictures: Iterable[np.ndarray], fps: float) -> bytes:
     """Pictures `[height, width, 3]` as a gif that plays again and again.
 
     Args:
       pictures: uint8.
       fps: pictures a second; a gif's times are whole hundredths of a second.
     """
+    pictures = list(pictures)
     palette = _palette(pictures)
     plain = [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE)
              for p in pictures]  # fmt: skip
     out = io.BytesIO()
     plain[0].save(
-        out, "GIF", save_all=True, append_images=plain[1:], duration=max(2, round(100 / fps)) * 10,
+        out, "GIF", save_all=True, append_images=plain[1:], duration=10 * round(100 / fps),
         loop=0, optimize=False,
     )  # fmt: skip
     return out.getvalue()
@@ -45,33 +51,42 @@ def _palette(pictures: Sequence[np.ndarray]) -> Image.Image:
     return Image.fromarray(np.concatenate(shown)).quantize(COLOURS, Image.Quantize.FASTOCTREE)
 
 
-def mp4(pictures: Sequence[np.ndarray], fps: float) -> bytes:
+def mp4(pictures: Iterable[np.ndarray], fps: float) -> bytes:
     """Pictures `[height, width, 3]` as H.264 in an mp4.
 
+    Args:
+      pictures: uint8; each is encoded as it comes.
+      fps: pictures a second.
+
     Raises:
-      BadInput: imageio-ffmpeg is not installed.
+      BadInput: there is no ffmpeg, or it cannot encode them.
     """
-    height, width = pictures[0].shape[:2]
+    pictures = iter(pictures)
+    first = next(pictures)
+    raw = RAW.format(width=first.shape[1], height=first.shape[0], fps=fps)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        writer = encoder().write_frames(str(path), (width, height), fps=fps, macro_block_size=2)
-        with warnings.catch_warnings(category=RuntimeWarning, action="ignore"):
-            writer.send(None)  # jax warns of forks, but here another program follows at once
-        for picture in pictures:
-            writer.send(np.ascontiguousarray(picture))
-        writer.close()
+        command = [encoder(), *raw.split(), *H264.split(), str(path)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+            assert ffmpeg.stdin
+            with contextlib.suppress(BrokenPipeError):  # it says why at its end
+                for picture in itertools.chain([first], pictures):
+                    ffmpeg.stdin.write(picture.tobytes())
+            said = ffmpeg.communicate()[1].decode(errors="replace")
+        if ffmpeg.returncode:
+            raise BadInput(f"ffmpeg cannot encode the mp4 in {folder}: {' '.join(said.split())}")
         return path.read_bytes()
 
 
-def encoder() -> Any:
-    """imageio_ffmpeg, of the extra `video`.
+def encoder() -> str:
+    """The ffmpeg of imageio-ffmpeg, of the extra `video`.
 
     Raises:
-      BadInput: it is not installed.
+      BadInput: there is none.
     """
     try:
-        return importlib.import_module("imageio_ffmpeg")
-    except ImportError:
+        return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
         raise BadInput(
             'mp4 needs imageio-ffmpeg: pip install "genidm[video]"; .gif and .html do not'
         ) from None

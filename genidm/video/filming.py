@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ import mujoco
 import numpy as np
 
 from genidm import controller
+from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Steering, Test
 from genidm.evaluation.scenarios import scenarios
 from genidm.evaluation.waypoints import Follow, Journeys, follow
-from genidm.files import Torn, load_arrays, load_json
-from genidm.robots import Robot, State, by_name, remade
+from genidm.files import MANIFEST, Torn, load_arrays, load_json
+from genidm.robots import Robot, by_name, remade
 from genidm.store import Stage
 
 # Robots that walk at once, filled up with some of them again: a program is then compiled once
@@ -26,6 +28,7 @@ from genidm.store import Stage
 LANES = 16
 # By their numbers in a test seed.
 EPISODES = (0, 1, 2)
+MOST_EPISODES = 10**6  # of a test seed
 # Seconds; who has not arrived by then goes round and round.
 LONGEST = 20.0
 
@@ -74,6 +77,10 @@ class Take:
         reached = (~self.left(seconds)).sum(-1)
         return self.waypoints[np.minimum(reached, len(self.waypoints) - 1)]
 
+    def place(self, seconds: np.ndarray) -> np.ndarray:
+        """Where the base is at some times `[n]`: `[n, 3]`, metres."""
+        return between(self.position, self.times, seconds)
+
     def at(self, model: mujoco.MjModel, seconds: np.ndarray) -> np.ndarray:
         """Poses `[n, nq]` at some times `[n]`, between the steps on the straight way."""
         before = np.clip(seconds // self.control_step, 0, len(self.qpos) - 2).astype(int)
@@ -100,6 +107,11 @@ class Film:
     drawing: mujoco.MjSpec
     takes: list[Take]
     reach: float
+
+
+def between(x: np.ndarray, times: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """`x [t, n]`, known at some times `[t]`, at others `[m]`: `[m, n]`, on straight lines."""
+    return np.stack([np.interp(seconds, times, column) for column in x.T], axis=-1)
 
 
 def film(
@@ -129,15 +141,11 @@ def film(
       BadInput: the robot has no drawing, or the waypoints are none.
     """
     settings, drawing = settings or Follow(), robot.drawing()
-
-    def physics(state: State) -> Any:
-        return state.physics
-
     fill = np.arange(-(-len(keys) // LANES) * LANES) % len(keys)
     points = np.asarray(waypoints)
     made = follow(
         robot, steering, points[fill] if points.ndim == 3 else points, keys[fill], yaw[fill],
-        settings=settings, watch=physics, quiet=quiet,
+        settings=settings, watch=operator.attrgetter("physics"), quiet=quiet,
     )  # fmt: skip
     takes = list(_takes(made, robot.posture(made.watched)))[: len(keys)]
     return Film(title or robot.name, drawing, takes, settings.reach)
@@ -171,7 +179,7 @@ def film_test(
       BadInput: the robot has no drawing, or there is no such episode.
     """
     robot.drawing()  # before anything is computed
-    bank, test = scenarios(robot, 1, count_to(episodes), first_seed=seed), Test()
+    bank, test = scenarios(robot, 1, count_to(episodes, seed), first_seed=seed), Test()
     settings = Follow(steps(robot, seconds, test.max_steps), test.reach)
     keys, yaw, target = (x[0, np.asarray(episodes)] for x in (bank.keys, bank.yaw, bank.target))
     return film(robot, steering, target[:, None], keys, yaw, settings, title, quiet=quiet)
@@ -179,7 +187,7 @@ def film_test(
 
 def film_tested(
     robot: Robot,
-    test: Path,
+    test: Path | str,
     episodes: Sequence[int] = (),
     seconds: float = LONGEST,
     title: str = "",
@@ -196,11 +204,11 @@ def film_tested(
     Raises:
       BadInput: the robot has no drawing, or the test has not recorded the episodes.
     """
-    drawing, settings = robot.drawing(), Stage(test).summary()["test"]
-    tree, _ = load_arrays(test / "episodes")
+    drawing, settings = robot.drawing(), _said(test, "test")
+    tree, _ = load_arrays(Path(test) / "episodes")
     recordings, outcome = tree.get("recordings", {}), tree["episodes"]
     most, takes = steps(robot, seconds, settings["max_steps"]), list[Take]()
-    for i in episodes or sorted(map(int, recordings)):
+    for i in episodes or sorted(map(int, recordings)) or EPISODES:
         if str(i) not in recordings:
             raise BadInput(f"{test} has no recording of episode {i}")
         made = recordings[str(i)]
@@ -220,42 +228,46 @@ def film_tested(
 
 
 def film_run(
-    run: Path,
+    run: Path | str,
     episodes: Sequence[int] = (),
     waypoints: Any = None,
     seed: int = 0,
     seconds: float = LONGEST,
     reach: float = Follow.reach,
     engine: str | None = None,
+    robot: Robot | None = None,
 ) -> Film:
     """Films the controller that lies in a run's directory (METHOD-SEED-…).
 
     Args:
       run: the directory of a fit or a baseline, as cells leave it under --out.
       episodes: numbers of the test's episodes, or of the starts; `EPISODES` and 0, unless given.
-      waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test.
+      waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test, and where
+        one of the run's tests has recorded the episodes, as they went.
       seed: of the test, or of the starts.
       seconds: a longer journey ends here.
       reach: metres; a given waypoint is reached when it is this near (the test has its own).
       engine: that steps the robot; the run's own, unless given.
+      robot: what walks; as the run's config has it, unless given.
 
     Raises:
       BadInput: no controller lies there, its robot has no drawing, or a number cannot be.
     """
-    summary, robot = Stage(run).summary(), robot_of(run, engine)
-    steering, title = controller.load(run, robot), f"{summary['method']}, {robot.name}"
+    starts = episodes or (EPISODES if waypoints is None else (0,))
+    highest, robot = count_to(starts, seed), robot or robot_of(run, engine)
+    title = f"{_said(run, 'method')}, {robot.name}"
     if waypoints is None:
         test = recorded(run, robot, episodes) if seed == 0 else None
         if test:
             return film_tested(robot, test, episodes, seconds, title)
-        return film_test(robot, steering, episodes or EPISODES, seed, seconds, title)
-    starts = episodes or (0,)
-    keys = jax.random.split(jax.random.key(seed), count_to(starts))[np.asarray(starts)]
+        return film_test(robot, controller.load(run, robot), starts, seed, seconds, title)
+    keys = jax.random.split(jax.random.key(seed), highest)[np.asarray(starts)]
     settings = Follow(steps(robot, seconds, Follow.max_steps), reach)
+    steering = controller.load(run, robot)
     return film(robot, steering, waypoints, keys, jnp.zeros(len(keys)), settings, title)
 
 
-def recorded(run: Path, robot: Robot, episodes: Sequence[int] = ()) -> Path | None:
+def recorded(run: Path | str, robot: Robot, episodes: Sequence[int] = ()) -> Path | None:
     """The newest test of a run, on the robot's engine, that has recorded some episodes.
 
     Args:
@@ -263,24 +275,33 @@ def recorded(run: Path, robot: Robot, episodes: Sequence[int] = ()) -> Path | No
       robot: what walks.
       episodes: those that it must have recorded; any, unless given.
     """
-    done = sorted(run.resolve().parent.glob("test-*/done.json"), key=lambda p: p.stat().st_mtime)
-    for path in reversed(done):
-        summary = load_json(path)
-        if (summary["fit"], summary["engine"]) == (run.resolve().name, robot.engine_name):
-            kept = load_arrays(path.parent / "episodes", mmap=True)[0].get("recordings", {})
-            if kept and all(str(i) in kept for i in episodes):
-                return path.parent
+    run = Path(run).resolve()
+    done = sorted(run.parent.glob("test-*/done.json"), key=lambda p: p.stat().st_mtime)
+    for test in (path.parent for path in reversed(done)):
+        try:
+            of = _said(test, "fit"), _said(test, "engine")
+        except BadInput:
+            continue  # somebody else's: no reason to have no film at all
+        if of == (run.name, robot.engine_name):
+            # By its files' names: who reads them sees whether they are whole.
+            names = [name.split(".") for name in load_json(test / "episodes" / MANIFEST)]
+            kept = {name[1] for name in names if name[0] == "recordings"}
+            if kept and kept.issuperset(map(str, episodes)):
+                return test
     return None
 
 
-def count_to(episodes: Sequence[int]) -> int:
+def count_to(episodes: Sequence[int], seed: int = 0) -> int:
     """How many there must be, so that there are episodes of these numbers.
 
     Raises:
-      BadInput: there is no such episode, or none is named.
+      BadInput: there is no such episode, none is named, or there is no such seed.
     """
-    if not episodes or min(episodes) < 0:
-        raise BadInput("a film is of episodes 0, 1, 2, …, and of at least one")
+    check_value("the seed of a film", seed, count(0, 2**32 - 1))
+    if not episodes:
+        raise BadInput("a film is of at least one episode")
+    for i in episodes:
+        check_value("the number of an episode", i, count(0, MOST_EPISODES - 1))
     return max(episodes) + 1
 
 
@@ -295,12 +316,16 @@ def steps(robot: Robot, seconds: float, most: int) -> int:
     return int(min(seconds / robot.control_step, most))
 
 
-def robot_of(run: Path, engine: str | None = None) -> Robot:
+def robot_of(run: Path | str, engine: str | None = None) -> Robot:
     """The robot that a run's controller was made for, with the settings it had.
 
     A fit's config leaves them to the experience beside it; where that is gone, the robot is
     taken as it comes. `engine` takes the place of the run's own.
+
+    Raises:
+      BadInput: it is not the directory of a finished run, or no robot can be made so.
     """
+    run, name = Path(run), _said(run, "robot")
     experience = Stage(run).summary().get("experience")
     for stage in (run, run.parent / experience) if experience else (run,):
         try:
@@ -309,14 +334,22 @@ def robot_of(run: Path, engine: str | None = None) -> Robot:
             continue
         if settings:
             return remade(settings | ({"engine": engine} if engine else {}))
-    return by_name(Stage(run).summary()["robot"], engine)
+    return by_name(name, engine)
+
+
+def _said(directory: Path | str, name: str) -> Any:
+    """What the summary of a finished stage says; BadInput where it does not say it."""
+    summary = Stage(Path(directory)).summary()
+    if not isinstance(summary, dict) or name not in summary:
+        raise BadInput(f"{directory} cannot be filmed: its done.json names no {name}")
+    return summary[name]
 
 
 def _takes(made: Journeys, qpos: np.ndarray) -> Iterator[Take]:
-    for i, count in enumerate(made.steps + 1):
+    for i, states in enumerate(made.steps + 1):
         yield Take(
-            qpos=qpos[i, :count],
-            position=made.position[i, :count],
+            qpos=qpos[i, :states],
+            position=made.position[i, :states],
             waypoints=made.waypoints[i],
             arrival=made.arrival[i],
             fell=bool(made.fell[i]),

@@ -20,17 +20,8 @@ FPS = 20.0
 # What is shown in whole numbers: metres in thousandths, quaternions in ten thousandths.
 PLACE, TURN = 1e3, 1e4
 HEIGHT = 460  # pixels, in a notebook
-# MuJoCo shows the groups below this one, and keeps collision shapes in those above.
-HIDDEN = 3
 
-_KINDS = mujoco.mjtGeom
-KINDS = {
-    _KINDS.mjGEOM_SPHERE: "sphere",
-    _KINDS.mjGEOM_CAPSULE: "capsule",
-    _KINDS.mjGEOM_BOX: "box",
-    _KINDS.mjGEOM_CYLINDER: "cylinder",
-    _KINDS.mjGEOM_ELLIPSOID: "ellipsoid",
-}
+KINDS = {"sphere", "capsule", "box", "cylinder", "ellipsoid"}  # of geoms that the viewer draws
 
 
 class Page(str):
@@ -58,60 +49,57 @@ def contents(film: Film) -> dict[str, Any]:
     made of, each in the frame of a body, and the `takes`. A take's `frames` are rows of whole
     numbers: the base's x, y, z (mm), then for each body x, y, z (mm) and quaternion (1e-4).
     """
-    model = film.drawing.compile()
-    data = mujoco.MjData(model)
-    shown = [i for i in range(model.ngeom) if _visible(model, i)]
+    model, start = film.drawing.compile(), film.takes[0].qpos[0]
+    shown = _shown(model)
     bodies = sorted({int(model.geom_bodyid[i]) for i in shown})
-    data.qpos = film.takes[0].qpos[0]
-    mujoco.mj_forward(model, data)
     return {
         "title": film.title,
         "fps": FPS,
         "reach": film.reach,
-        "size": round(size(model, data), 3),
-        "geoms": [_geom(model, i, bodies) for i in shown],
-        "takes": [_take(model, data, bodies, take) for take in film.takes],
+        "size": round(size(model, start), 3),
+        "geoms": [_geom(model, i, colour, bodies) for i, colour in shown.items()],
+        "takes": [_take(model, bodies, take) for take in film.takes],
     }
 
 
-def _visible(model: mujoco.MjModel, geom: int) -> bool:
-    plane = model.geom_type[geom] == _KINDS.mjGEOM_PLANE
-    return not plane and model.geom_group[geom] < HIDDEN and _rgba(model, geom)[3] > 0
+def _shown(model: mujoco.MjModel) -> dict[int, np.ndarray]:
+    """The geoms that MuJoCo draws, but for floors, and their colours `[4]` from 0 to 1."""
+    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, maxgeom=10_000)
+    mujoco.mj_forward(model, data)
+    mujoco.mjv_updateScene(
+        model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene
+    )
+    drawn = (g for g in scene.geoms[: scene.ngeom] if g.objtype == mujoco.mjtObj.mjOBJ_GEOM)
+    return {g.objid: g.rgba.copy() for g in drawn if g.type != mujoco.mjtGeom.mjGEOM_PLANE}
 
 
-def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """A geom's colour; its material's, where it has one and no colour of its own."""
-    own, material = model.geom_rgba[geom], model.geom_matid[geom]
-    plain = np.allclose(own, [0.5, 0.5, 0.5, 1.0])
-    return model.mat_rgba[material] if material >= 0 and plain else own
-
-
-def _geom(model: mujoco.MjModel, geom: int, bodies: list[int]) -> dict[str, Any]:
+def _geom(
+    model: mujoco.MjModel, geom: int, colour: np.ndarray, bodies: list[int]
+) -> dict[str, Any]:
     """One geom; a mesh, or what else the viewer does not know, as the box around it."""
-    kind = KINDS.get(_KINDS(model.geom_type[geom]))
+    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+    known = kind in KINDS
     place, turn = model.geom_pos[geom], model.geom_quat[geom]
     middle, half = model.geom_aabb[geom].reshape(2, 3)
-    if kind is None:
+    if not known:
         offset = np.zeros(3)
         mujoco.mju_rotVecQuat(offset, middle, turn)
         place = place + offset
     return {
-        "kind": kind or "box",
+        "kind": kind if known else "box",
         "body": bodies.index(int(model.geom_bodyid[geom])),
-        "size": np.round(model.geom_size[geom] if kind else half, 4).tolist(),
+        "size": np.round(model.geom_size[geom] if known else half, 4).tolist(),
         "place": np.round(place, 4).tolist(),
         "turn": np.round(turn, 5).tolist(),
-        "colour": np.round(255 * _rgba(model, geom)[:3]).astype(int).tolist(),
+        "colour": np.round(255 * colour[:3]).astype(int).tolist(),
     }
 
 
-def _take(
-    model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], take: Take
-) -> dict[str, Any]:
+def _take(model: mujoco.MjModel, bodies: list[int], take: Take) -> dict[str, Any]:
+    data = mujoco.MjData(model)
     seconds = np.minimum(np.arange(np.ceil(take.seconds * FPS - 1e-6) + 1) / FPS, take.seconds)
-    base = np.stack([np.interp(seconds, take.times, axis) for axis in take.position.T], axis=-1)
     rows = []
-    for middle, pose in zip(base, take.at(model, seconds), strict=True):
+    for middle, pose in zip(take.place(seconds), take.at(model, seconds), strict=True):
         data.qpos = pose
         mujoco.mj_kinematics(model, data)
         placed = np.c_[PLACE * data.xpos[bodies], TURN * data.xquat[bodies]]

@@ -62,8 +62,11 @@ def _floor(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
 
 
-def size(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Metres from the middle of a robot to its farthest part, in the pose of `data`."""
+def size(model: mujoco.MjModel, qpos: np.ndarray) -> float:
+    """Metres from the middle of a robot to its farthest part, in the pose `qpos [nq]`."""
+    data = mujoco.MjData(model)
+    data.qpos = qpos
+    mujoco.mj_kinematics(model, data)
     parts = np.flatnonzero(model.geom_bodyid > 0)
     middle = data.geom_xpos[parts].mean(0)
     far = np.linalg.norm(data.geom_xpos[parts] - middle, axis=-1) + model.geom_rbound[parts]

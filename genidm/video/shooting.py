@@ -9,11 +9,12 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter1d
 
-from genidm.checks import check, count, number, positive
+from genidm.checks import check, count, number
 from genidm.progress import Progress
-from genidm.video import backends
-from genidm.video.filming import Film, Take
+from genidm.video.backends import renderer
+from genidm.video.filming import Film, Take, between
 from genidm.video.scenery import REACHED, RGBA, SUN, SUN_AWAY, TO_GO, TRAIL, scene, size
 
 # The camera: metres away in sizes of the robot, degrees, seconds that its moves are smoothed over.
@@ -50,7 +51,7 @@ class Shot:
 
     def __post_init__(self) -> None:
         size = count(16, 8192)
-        check(self, width=size, height=size, fps=positive(1000), hold=number(0, 3600))
+        check(self, width=size, height=size, fps=number(0.01, 1000), hold=number(0, 3600))
 
 
 def frames(film: Film, shot: Shot, quiet: bool = False) -> Iterator[np.ndarray]:
@@ -63,7 +64,7 @@ def frames(film: Film, shot: Shot, quiet: bool = False) -> Iterator[np.ndarray]:
     cues = [times(take, shot) for take in film.takes]
     with (
         Progress("pictures", sum(map(len, cues)), "pictures", quiet=quiet) as bar,
-        Eye(model, shot.width, shot.height) as eye,
+        renderer(model, shot.width, shot.height, MOST_MARKS + model.ngeom) as eye,
     ):
         for number, (take, seconds) in enumerate(zip(film.takes, cues, strict=True), 1):
             words = f"{film.title}   {number} of {len(cues)}" if len(cues) > 1 else film.title
@@ -78,82 +79,28 @@ def times(take: Take, shot: Shot) -> np.ndarray:
     return np.append(moving, [take.seconds] * (1 + round(shot.hold * shot.fps)))
 
 
-class Eye:
-    """A context manager that draws what a camera sees.
+def mark(
+    scene: mujoco.MjvScene, take: Take, left: np.ndarray, now: float, reach: float, size: float
+) -> None:
+    """Adds what stands beside the robot: its waypoints, and its way so far.
 
     Args:
-      model: what is drawn.
-      width, height: pixels.
-    """
-
-    def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        self.model, self.data = model, mujoco.MjData(model)
-        self._context = backends.context(width, height)
-        self._context.make_current()
-        self._pixels = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._pixels)
-        self._scene = mujoco.MjvScene(model, MOST_MARKS + model.ngeom)
-        self._rect = mujoco.MjrRect(0, 0, width, height)
-
-    def __enter__(self) -> Eye:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        # By hand: OSMesa's own clean-up fails, and says so, once the interpreter is going down.
-        self._pixels.free()
-        self._context.free()
-
-    def pose(self, qpos: np.ndarray) -> None:
-        """Puts the robot into a pose `[nq]`."""
-        self.data.qpos = qpos
-        mujoco.mj_forward(self.model, self.data)
-
-    def look(self, camera: mujoco.MjvCamera, marks: Marks) -> np.ndarray:
-        """The picture `[height, width, 3]` of the robot and of marks."""
-        self.data.light_xpos[:] = camera.lookat - SUN_AWAY * np.asarray(SUN)
-        everything, options = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvOption()
-        mujoco.mjv_updateScene(
-            self.model, self.data, options, None, camera, everything, self._scene
-        )
-        marks(self._scene)
-        self._context.make_current()
-        mujoco.mjr_render(self._rect, self._scene, self._pixels)
-        picture = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, self._rect, self._pixels)
-        return picture[::-1]
-
-
-@dataclasses.dataclass(frozen=True)
-class Marks:
-    """What is drawn beside the robot: its waypoints, and its way so far.
-
-    Attributes:
-      waypoints: `[W, 3]`, metres.
-      left: `[W]` bool, which of them are not reached yet.
-      way: `[n, 3]`, metres.
+      scene: what is added to.
+      take: the journey.
+      left: `[W]` bool, which waypoints are not reached yet.
+      now: seconds since the start.
       reach: metres.
       size: of the robot, metres.
     """
-
-    waypoints: np.ndarray
-    left: np.ndarray
-    way: np.ndarray
-    reach: float
-    size: float
-
-    def __call__(self, scene: mujoco.MjvScene) -> None:
-        """Adds them to a scene."""
-        kinds = mujoco.mjtGeom
-        for point, left in zip(self.waypoints, self.left, strict=True):
-            colour = TO_GO if left else REACHED
-            foot, top = point.copy(), point.copy()
-            foot[2], top[2] = 0.0, point[2] + HOVER * self.size
-            add(scene, kinds.mjGEOM_SPHERE, (BALL * self.size,) * 3, top, colour)
-            add(scene, kinds.mjGEOM_CYLINDER, (self.reach, 0.004, 0.0), foot, (*colour[:3], 0.4))
-            add_line(scene, foot, top, LINE / 2, colour)
-        floored = np.c_[self.way[:, :2], np.full(len(self.way), LINE)]
-        for a, b in itertools.pairwise(floored):
-            add_line(scene, a, b, LINE, TRAIL)
+    kinds = mujoco.mjtGeom
+    for point, to_go in zip(take.waypoints, left, strict=True):
+        colour = TO_GO if to_go else REACHED
+        foot, top = point * (1, 1, 0), point + np.array([0, 0, HOVER * size])
+        add(scene, kinds.mjGEOM_SPHERE, (BALL * size,) * 3, top, colour)
+        add(scene, kinds.mjGEOM_CYLINDER, (reach, 0.004, 0.0), foot, (*colour[:3], 0.4))
+        add_line(scene, foot, top, LINE / 2, colour)
+    for a, b in itertools.pairwise(_way(take, now)):
+        add_line(scene, a, b, LINE, TRAIL)
 
 
 def add(
@@ -176,53 +123,51 @@ def add_line(
     mujoco.mjv_connector(add(scene, kind, (radius,) * 3, a, colour), kind, radius, a, b)
 
 
-def _take(eye: Eye, film: Film, take: Take, seconds: np.ndarray) -> Iterator[np.ndarray]:
-    poses = take.at(eye.model, seconds)
-    eye.pose(poses[0])
-    metres = size(eye.model, eye.data)
+def _take(
+    eye: mujoco.Renderer, film: Film, take: Take, seconds: np.ndarray
+) -> Iterator[np.ndarray]:
+    data, poses = mujoco.MjData(eye.model), take.at(eye.model, seconds)
+    metres = size(eye.model, poses[0])
     cameras = _cameras(take, seconds, metres)
     for pose, left, now, camera in zip(poses, take.left(seconds), seconds, cameras, strict=True):
-        eye.pose(pose)
-        yield eye.look(camera, Marks(take.waypoints, left, _way(take, now), film.reach, metres))
+        data.qpos = pose
+        mujoco.mj_forward(eye.model, data)
+        data.light_xpos[:] = camera.lookat - SUN_AWAY * np.asarray(SUN)
+        eye.update_scene(data, camera)
+        mark(eye.scene, take, left, now, film.reach, metres)
+        yield eye.render()
 
 
 def _way(take: Take, now: float) -> np.ndarray:
-    """The way up to a time `[n, 3]`, in pieces of a length that can be seen."""
-    made = take.position[take.times <= now + 1e-6]
-    length = np.cumsum(np.linalg.norm(np.diff(made[:, :2], axis=0, prepend=made[:1, :2]), axis=1))
+    """The way up to a time `[n, 3]`, on the floor, in pieces of a length that can be seen."""
+    made = take.position[take.times <= now + 1e-6] * (1, 1, 0) + (0, 0, LINE)
+    length = np.cumsum(np.linalg.norm(np.diff(made, axis=0, prepend=made[:1]), axis=1))
     return made[np.unique(length // PIECE, return_index=True)[1]]
 
 
 def _cameras(take: Take, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
     """Behind the robot and to its side, so that where it goes is in the picture."""
-    t = take.times
-    ahead = take.goal(t)[:, :2] - take.position[:, :2]
+    ahead = take.goal(take.times)[:, :2] - take.position[:, :2]
     turn = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    place = _calm(take.position, CALM_PLACE / take.control_step)
-    turn = _calm(turn[:, None], CALM_TURN / take.control_step)[:, 0]
+    calm = np.c_[_calm(take.position, CALM_PLACE, take), _calm(turn, CALM_TURN, take)]
     cameras = []
-    for now in seconds:
+    for *place, azimuth in between(calm, take.times, seconds):
         camera = mujoco.MjvCamera()
-        camera.azimuth = np.degrees(np.interp(now, t, turn)) + ASIDE
-        camera.elevation, camera.distance = DOWN, AWAY * size
-        camera.lookat = [np.interp(now, t, axis) for axis in place.T]
+        camera.azimuth, camera.elevation = np.degrees(azimuth) + ASIDE, DOWN
+        camera.distance, camera.lookat = AWAY * size, place
         cameras.append(camera)
     return cameras
 
 
-def _calm(x: np.ndarray, sigma: float) -> np.ndarray:
-    """`x [t, n]` smoothed by a Gaussian of `sigma` steps; beyond its ends it stays as it is."""
-    reach = max(1, int(3 * sigma))
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    padded = np.pad(x, ((reach, reach), (0, 0)), mode="edge")
-    columns = [np.convolve(column, weights / weights.sum(), "valid") for column in padded.T]
-    return np.stack(columns, axis=-1)
+def _calm(x: np.ndarray, sigma: float, take: Take) -> np.ndarray:
+    """`x [t, …]` smoothed over `sigma` seconds; beyond its ends it stays as it is."""
+    return gaussian_filter1d(x, sigma / take.control_step, axis=0, mode="nearest")
 
 
 def _gauge(take: Take, now: float) -> str:
     """Time, and the distance to the next waypoint."""
-    o = [np.interp(now, take.times, axis) for axis in take.position[:, :2].T]
-    apart = np.linalg.norm(take.goal(np.array([now]))[0, :2] - o)
+    at = np.array([now])
+    apart = np.linalg.norm((take.goal(at) - take.place(at))[0, :2])
     return f"{now:.1f} s   {apart:.2f} m"
 
 
