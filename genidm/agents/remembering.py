@@ -78,7 +78,7 @@ def buffers(tree: Any) -> list[Buffer]:
 
 
 def emptied(tree: Any) -> Any:
-    """The tree with `[0, T, B, ...]` for the rows of its buffers: their shapes, and nothing more."""
+    """The tree with `[0, T, B, ...]` for the rows of its buffers: their shapes and no more."""
     return _exchanged(tree, lambda b: b.replace(rows=jax.tree.map(_no_elements, b.rows)))
 
 
