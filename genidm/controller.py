@@ -191,5 +191,5 @@ def _as_wanted(path: Path | str, found: Any, wanted: Any) -> None:
     if differs := trees.difference(trees.kinds(found), trees.kinds(wanted)):
         name, there, here = differs
         raise BadInput(f"{path}: {name} is {there}, where its architecture has {here}")
-    if name := trees.not_finite(found):
-        raise BadInput(f"{path}: {name} holds NaN or infinity")
+    if broken := trees.not_finite(found):
+        raise BadInput(f"{path}: {broken} holds NaN or infinity")

@@ -49,17 +49,16 @@ class Remembering:
             return None
         step, tree = found
         self._parts = self.checkpoints.parts(step)
-        (rows,) = [b.rows for b in buffers(like)] or [None]
-        return step, _exchanged(tree, lambda buffer: Buffer(self._assembled(rows), buffer.written))
+        return step, _exchanged(tree, self._filled)
 
-    def _assembled(self, like: Any) -> Any:
-        """The rows `[T, B, ...]` of a ring with the shapes of `like`."""
-        rows = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    def _filled(self, buffer: Buffer) -> Buffer:
+        """An emptied buffer with its rows."""
+        rows = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), buffer.rows)
         for part in self._parts:
             at = np.arange(*_span(part)) % len(rows.last)
             for field, x in self.checkpoints.load_part(part).items():
                 getattr(rows, field)[at] = x
-        return rows
+        return buffer.replace(rows=rows)
 
 
 def _span(part: str) -> tuple[int, int]:
