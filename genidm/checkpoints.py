@@ -45,6 +45,9 @@ except BadInput:
 class Checkpoints:
     """The newest states of a long stage, `directory/step_000000123`, written by orbax.
 
+    Orbax's CheckpointManager would name and keep them, too, but it has no checksum, and it syncs
+    nothing but the arrays: neither what it writes beside them nor the renames.
+
     What grows from state to state can lie beside them in parts, `directory/part_NAME`, which are
     written once: a step names those that it is no use without.
 
@@ -104,7 +107,7 @@ class Checkpoints:
         with files.disk(self.directory):
             for step in set(self.steps()) - set(kept):
                 files.remove(self._path(step))
-            named = {self._part(name) for step in kept for name in self._parts(step)}
+            named = {self._part(name) for step in kept for name in self.parts(step)}
             for part in set(self.directory.glob("part_*")) - named:
                 files.remove(part)
 
@@ -117,12 +120,8 @@ class Checkpoints:
         found = self._part(name).glob("*.npy")
         return {file.stem: np.load(file, mmap_mode="r", allow_pickle=False) for file in found}
 
-    def parts(self, step: int) -> list[str]:
-        """The parts that a step names, in their order."""
-        return list(self._parts(step))
-
-    def _parts(self, step: int) -> dict[str, int]:
-        """The parts that a step names, and what `_checksum` says of each; none of a torn step."""
+    def parts(self, step: int) -> dict[str, int]:
+        """The parts that a step names, in order, with their checksums; none of a torn step."""
         try:
             return files.load_json(self._path(step) / "leaves.json").get("parts", {})
         except files.Torn:
@@ -155,7 +154,7 @@ class Checkpoints:
     def _verify(self, step: int) -> None:
         """Raises Torn unless a step is whole, and so are its parts, as they were."""
         files.verify(self._path(step))
-        for name, checksum in self._parts(step).items():
+        for name, checksum in self.parts(step).items():
             files.verify(self._part(name))
             if _checksum(self._part(name)) != checksum:
                 raise files.Torn(f"{self._part(name)} is not what {self._path(step)} names")

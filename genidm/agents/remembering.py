@@ -48,7 +48,7 @@ class Remembering:
         if found is None:
             return None
         step, tree = found
-        self._parts = self.checkpoints.parts(step)
+        self._parts = list(self.checkpoints.parts(step))
         return step, _exchanged(tree, self._filled)
 
     def _filled(self, buffer: Buffer) -> Buffer:
