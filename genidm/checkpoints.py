@@ -1,4 +1,4 @@
-"""The newest states of a long stage, kept by orbax; the one before stands in for a torn one."""
+"""The newest states of a long stage, written by orbax; the one before stands in for a torn one."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import os
 import re
 import sys
 import time
+import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from genidm import files
+from genidm import files, trees
 from genidm.errors import BadInput
 
 
@@ -43,9 +45,15 @@ except BadInput:
 class Checkpoints:
     """The newest states of a long stage, `directory/step_000000123`, written by orbax.
 
+    Orbax's CheckpointManager would name and keep them, too, but it has no checksum, and it syncs
+    nothing but the arrays: neither what it writes beside them nor the renames.
+
+    What grows from state to state can lie beside them in parts, `directory/part_NAME`, which are
+    written once: a step names those that it is no use without.
+
     Attributes:
       directory: where they lie.
-      keep: how many are kept: two, so that there is one before a torn one.
+      keep: how many steps are kept: two, so that there is one before a torn one.
     """
 
     def __init__(self, directory: Path | str, keep: int = 2):
@@ -59,31 +67,65 @@ class Checkpoints:
     def _path(self, step: int) -> Path:
         return self.directory / f"step_{step:09d}"
 
+    def _part(self, name: str) -> Path:
+        return self.directory / f"part_{name}"
+
     def steps(self) -> list[int]:
         """The steps that are there, oldest first, torn ones too."""
         found = (re.fullmatch(r"step_(\d+)", p.name) for p in self.directory.glob("step_*"))
         return sorted(int(m[1]) for m in found if m)
 
-    def save(self, step: int, tree: Any) -> None:
+    def save(self, step: int, tree: Any, parts: Sequence[str] = ()) -> None:
         """Keeps a tree of arrays (on any devices), typed random keys and Python numbers.
 
         Steps are saved in order: one that is there and lies beyond `step` is torn, or of a
-        future that a resume has left, and is removed with the old ones.
+        future that a resume has left, and is removed with the old ones, and with the parts that
+        no step names any more.
+
+        Args:
+          step: its number.
+          tree: what is kept.
+          parts: names of the parts that belong to it; `save_part` has written them.
         """
-        leaves = _named(tree)
+        leaves = trees.named(tree)
         keys = {name: str(jax.random.key_impl(x)) for name, x in leaves.items() if files.is_key(x)}
         raw = {k: jax.random.key_data(x) if k in keys else x for k, x in leaves.items()}
         arrays = {name: files.as_array(name, x) for name, x in raw.items()}
-        kinds = {name: _kind(x) for name, x in leaves.items()}
+        record = {
+            "kinds": trees.kinds(tree), "keys": keys,
+            "parts": {name: _checksum(self._part(name)) for name in parts},
+        }  # fmt: skip
         with files.building(self._path(step)) as scratch:
-            files.save_json(scratch / "leaves.json", {"kinds": kinds, "keys": keys})
+            files.save_json(scratch / "leaves.json", record)
             # orbax refuses arrays without elements; their kind is all there is to them.
             _write(scratch / "tree", {name: x for name, x in arrays.items() if x.size})
         self._saved = time.monotonic()
+        self._tidy([s for s in self.steps() if s <= step][-self.keep :])
+
+    def _tidy(self, kept: Sequence[int]) -> None:
+        """Removes all steps but these, and the parts that none of them names."""
         with files.disk(self.directory):
-            keep = [s for s in self.steps() if s <= step][-self.keep :]
-            for old in set(self.steps()) - set(keep):
-                files.remove(self._path(old))
+            for step in set(self.steps()) - set(kept):
+                files.remove(self._path(step))
+            named = {self._part(name) for step in kept for name in self.parts(step)}
+            for part in set(self.directory.glob("part_*")) - named:
+                files.remove(part)
+
+    def save_part(self, name: str, arrays: Mapping[str, Any]) -> None:
+        """Writes a part, before the first step that names it."""
+        files.save_arrays(self._part(name), arrays, {}, overwrite=True)
+
+    def load_part(self, name: str) -> dict[str, np.ndarray]:
+        """A part of a step that `latest` has found whole; its arrays stay on the disk."""
+        found = self._part(name).glob("*.npy")
+        return {file.stem: np.load(file, mmap_mode="r", allow_pickle=False) for file in found}
+
+    def parts(self, step: int) -> dict[str, int]:
+        """The parts that a step names, in order, with their checksums; none of a torn step."""
+        try:
+            return files.load_json(self._path(step) / "leaves.json").get("parts", {})
+        except files.Torn:
+            return {}
 
     def latest(self, like: Any) -> tuple[int, Any] | None:
         """The newest step that is not torn, and its tree; None if there is none.
@@ -99,14 +141,28 @@ class Checkpoints:
         Raises:
           BadInput: the leaves have other names, shapes or dtypes than those of `like`.
         """
-        for step in reversed(self.steps()):
+        for step in reversed(steps := self.steps()):
             try:
-                files.verify(self._path(step))
+                self._verify(step)
             except files.Torn as torn:
-                print(f"warning: {torn}; trying the one before it", file=sys.stderr)
+                then = "beginning anew" if step == steps[0] else "trying the one before it"
+                print(f"warning: {torn}; {then}", file=sys.stderr)
             else:
                 return step, _restore(self._path(step), like)
         return None
+
+    def _verify(self, step: int) -> None:
+        """Raises Torn unless a step is whole, and so are its parts, as they were."""
+        files.verify(self._path(step))
+        for name, checksum in self.parts(step).items():
+            files.verify(self._part(name))
+            if _checksum(self._part(name)) != checksum:
+                raise files.Torn(f"{self._part(name)} is not what {self._path(step)} names")
+
+
+def _checksum(part: Path) -> int:
+    """Of a part's manifest, which has those of its files."""
+    return zlib.crc32((part / files.MANIFEST).read_bytes())
 
 
 def _write(directory: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -125,13 +181,10 @@ def _write(directory: Path, arrays: dict[str, np.ndarray]) -> None:
 def _restore(path: Path, like: Any) -> Any:
     import orbax.checkpoint as ocp
 
-    wanted, record = _named(like), files.load_json(path / "leaves.json")
-    kinds = {name: _kind(x) for name, x in wanted.items()}
-    for name in sorted(kinds.keys() | record["kinds"].keys()):
-        there, here = record["kinds"].get(name, "absent"), kinds.get(name, "absent")
-        if there != here:
-            difference = f"{name} is {there} there, {here} here"
-            raise BadInput(f"{path} is a checkpoint of another robot or setting: {difference}")
+    wanted, record = trees.named(like), files.load_json(path / "leaves.json")
+    if differs := trees.difference(record["kinds"], trees.kinds(like)):
+        difference = "{} is {} there, {} here".format(*differs)
+        raise BadInput(f"{path} is a checkpoint of another robot or setting: {difference}")
     tree = (path / "tree").absolute()
     with files.disk(path):
         arrays = ocp.PyTreeCheckpointer().restore(tree) if tree.exists() else {}
@@ -150,18 +203,3 @@ def _leaf(array: Any, key: str | None, like: Any) -> Any:
     dtype = getattr(like, "dtype", array.dtype)
     # By way of a Python number, so that one too large for the dtype is an error.
     return array if array.dtype == dtype else np.array(array.item(), dtype)
-
-
-def _named(tree: Any) -> dict[str, Any]:
-    """Leaves by their paths, which do not tell a dict from a dataclass or a tuple."""
-    pairs = jax.tree_util.tree_flatten_with_path(tree)[0]
-    named = {jax.tree_util.keystr(p, simple=True, separator="/") or "tree": x for p, x in pairs}
-    if len(named) < len(pairs):
-        raise BadInput("two leaves of a checkpoint have one name")
-    return named
-
-
-def _kind(x: Any) -> str:
-    """Dtype and shape; of one number only its kind, as jit makes arrays of Python's."""
-    shape, dtype = np.shape(x), str(x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype)
-    return f"{dtype}{list(shape)}" if shape else dtype.rstrip("0123456789")

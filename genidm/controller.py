@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from genidm import files, symmetry
+from genidm import files, symmetry, trees
 from genidm.agents.policy import Policy, described
 from genidm.config import plain
 from genidm.errors import BadInput
@@ -191,16 +191,8 @@ def _fields(listed: Any) -> str:
 
 def _as_wanted(path: Path | str, found: Any, wanted: Any) -> None:
     """Refuses parameters of other names, shapes or dtypes than the architecture's, or NaN."""
-    there, here = (
-        {jax.tree_util.keystr(k): x for k, x in jax.tree_util.tree_leaves_with_path(tree)}
-        for tree in (found, wanted)
-    )
-    for name in sorted(there.keys() | here.keys()):
-        kinds = [
-            f"{x.dtype}{list(x.shape)}" if (x := tree.get(name)) is not None else "absent"
-            for tree in (there, here)
-        ]
-        if kinds[0] != kinds[1]:
-            raise BadInput(f"{path}: {name} is {kinds[0]}, where its architecture has {kinds[1]}")
-        if not np.isfinite(there[name]).all():
-            raise BadInput(f"{path}: {name} holds NaN or infinity")
+    if differs := trees.difference(trees.kinds(found), trees.kinds(wanted)):
+        name, there, here = differs
+        raise BadInput(f"{path}: {name} is {there}, where its architecture has {here}")
+    if broken := trees.not_finite(found):
+        raise BadInput(f"{path}: {broken} holds NaN or infinity")

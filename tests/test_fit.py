@@ -390,3 +390,17 @@ def test_methods_refuse_what_they_cannot_do(wrong: dict) -> None:
 def test_a_latent_needs_pairs() -> None:
     with pytest.raises(BadInput, match="one view only"):
         fit(ROBOT, samples(views=1), jax.random.key(0), SMALL)
+
+
+@pytest.mark.parametrize("latent_size", [None, K])
+def test_a_fit_that_ends_in_nan_is_refused(tmp_path: Path, latent_size: int | None) -> None:
+    stage = Stage.open(tmp_path, "fit", {})
+    settings = dataclasses.replace(SMALL, learning_rate=1e30, latent_size=latent_size)
+
+    def work() -> dict:
+        fit(ROBOT, linear(64), jax.random.key(0), settings, chunk=10, stage=stage, quiet=True)
+        return {}
+
+    with pytest.raises(BadInput, match=r"params/\S+ holds NaN or infinity after \d+ updates"):
+        stage.once(work)
+    assert not stage.done

@@ -9,11 +9,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from bits import same
 from killing import Killed, dies_at
 from point import Point
 from tiny import AGENTS, TEST, tiny
 
-from genidm import devices
+from genidm import devices, experience
 from genidm.agents import collect as collecting
 from genidm.agents.collect import collect
 from genidm.agents.frozen import Acting, Frozen
@@ -89,6 +90,19 @@ def test_killed_on_its_way_it_ends_with_the_same_bits(
                 dying.experience()
     killed = cell(Point(), rl, options(tmp_path / "killed")).experience()
     jax.tree.map(np.testing.assert_array_equal, killed, whole)
+
+
+def test_a_record_in_memory_is_not_read_back(
+    rl: methods.Inverse, tmp_path: Path, monkeypatch
+) -> None:
+    def refuse(*args) -> None:
+        raise AssertionError("read back")
+
+    with monkeypatch.context() as m:
+        m.setattr(experience, "load_chunks", refuse)
+        made = cell(Point(), rl, options(tmp_path)).experience()
+    read = cell(Point(), rl, options(tmp_path)).experience()  # by another process, later
+    same(made, read)
 
 
 def test_a_share_lies_between_0_and_1() -> None:

@@ -16,7 +16,7 @@ PACKAGE = Path(genidm.__file__).parent
 # Modules on one line know nothing of each other.
 ORDER = """
 errors evaluation.episodes quiet paper.protocol
-checks devices registry
+checks devices registry trees
 symmetry
 evaluation paper runs
 config
@@ -35,7 +35,7 @@ rollout tasks
 experience
 agents.policy agents.buffer
 agents.base agents.her
-agents.alternating agents.walking
+agents.alternating agents.walking agents.remembering
 agents.off_policy
 agents.*
 agents.frozen

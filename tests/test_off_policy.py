@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from bits import close, leaves, same
+from bits import close, flip, leaves, same, truncate
 from brax.training.acme import running_statistics
 from brax.training.agents.sac.losses import make_losses
 from brax.training.agents.sac.networks import make_sac_networks
@@ -31,11 +31,13 @@ from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.policy import no_statistics, normalize
+from genidm.agents.remembering import Remembering
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Test, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.experience import load_chunks
+from genidm.files import load_json
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import Robot, State
 from genidm.store import Stage
@@ -520,6 +522,54 @@ def test_a_collection_that_is_done_is_not_made_again(killed, monkeypatch) -> Non
     gather("SAC", stage=stage, keep=False)
     monkeypatch.setattr(Progress, "advance", dies_at(1))
     same(gather("SAC", stage=stage, keep=False), (None, undisturbed("SAC")[1]))
+
+
+@each
+@pytest.mark.parametrize("harm", [flip, truncate, Path.unlink])
+def test_with_a_torn_part_of_the_buffer_it_ends_in_the_same_bits(killed, name: str, harm) -> None:
+    """The newest part: the checkpoint before is gone on from. The oldest: all is done anew."""
+    for which, goes_on_from in ((-1, 2), (0, None)):
+        stage = killed(5, name, keep=True)
+        parts = sorted(stage.path("checkpoints").glob("part_*"))
+        assert stage.checkpoints().steps() == [2, 4] and len(parts) == 2
+        harm(parts[which] / "s.npy")
+        like = {"learner": undisturbed(name)[1], "chunks": 0}
+        found = Remembering(stage.checkpoints()).latest(like)
+        assert (found and found[0]) == goes_on_from
+        same(gather(name, stage=stage), undisturbed(name))
+        stage.clear_checkpoints()
+
+
+@each
+def test_a_checkpoint_writes_the_new_rows_alone(killed, name: str) -> None:
+    stage = killed(5, name, keep=False)
+    directory = stage.path("checkpoints")
+    spans = sorted(part.name.split("_")[1:] for part in directory.glob("part_*"))
+    assert [(int(first), int(end)) for first, end in spans] == [(0, 16), (16, 32)]
+    rows = sum(x.nbytes for x in jax.tree.leaves(undisturbed(name)[1].training.buffer.rows)) / 24
+    for part in directory.glob("part_*"):
+        size = sum(np.load(file).nbytes for file in part.glob("*.npy"))
+        assert size == 16 * rows
+    kinds = load_json(directory / "step_000000004" / "leaves.json")["kinds"]
+    rows = {kind for leaf, kind in kinds.items() if "/buffer/rows/" in leaf}
+    assert rows and all("[0, 24, 16" in kind for kind in rows)
+
+
+@each
+def test_what_has_learned_nan_is_not_done(tmp_path: Path, name: str) -> None:
+    agent, task = LEARNERS[name]
+    agent = dataclasses.replace(agent, learning_rate=1e30)
+    stage = Stage.open(tmp_path, "collect", {})
+
+    def work() -> dict:
+        collect(ROBOT, agent, ITERATIONS * SIZE, task=task, stage=stage, quiet=True)
+        return {}
+
+    with pytest.raises(
+        BadInput, match=r"training/networks/\S+ holds NaN or infinity after 640 int"
+    ):
+        stage.once(work)
+    assert not stage.done and not stage.checkpoints().steps()
 
 
 # ── bad input ───────────────────────────────────────────────────────────────────────────

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -355,6 +356,63 @@ def test_a_torn_record_is_not_gone_on_from(killed) -> None:
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(Torn, match="cut short"):
         gather(stage=stage)
+
+
+# ── what is not finite ──────────────────────────────────────────────────────────────────
+
+
+def test_a_learner_of_nan_is_refused_and_nothing_is_marked_done(tmp_path: Path) -> None:
+    agent = dataclasses.replace(AGENT, learning_rate=1e30)
+    stage = Stage.open(tmp_path, "collect", {})
+
+    def work() -> dict:
+        gather(agent, iterations=3, stage=stage)
+        return {}
+
+    for _ in range(2):  # the same command again says the same
+        with pytest.raises(BadInput, match=r"training/params/\S+ holds NaN or infinity after 384 "):
+            stage.once(work)
+        assert not stage.done and not stage.checkpoints().steps()
+        assert not stage.path("experience").exists()
+    with pytest.raises(BadInput, match="smaller learning rate"):
+        gather(agent, iterations=3)  # in memory alone, too
+
+
+class Breaking:
+    """An agent that works as another does, and whose state breaks in its nth iteration."""
+
+    def __init__(self, agent: Any, at: int, broken: Callable[[Any], Any]):
+        self.agent, self.lanes, self.unroll = agent, agent.lanes, agent.unroll
+        self.at, self.broken = at, broken
+
+    def learning(self, *args) -> Any:
+        learning, calls = self.agent.learning(*args), iter(range(1, 100))
+
+        def prepare(learner: Any) -> Any:
+            iterate = learning.prepare(learner)
+
+            def breaking(learner: Any) -> Any:
+                learner, *rest = iterate(learner)
+                return (self.broken(learner) if next(calls) == self.at else learner, *rest)
+
+            return breaking
+
+        return learning._replace(prepare=prepare)
+
+
+def with_infinity(learner: Any) -> Any:
+    mean = learner.training.statistics.mean.at[2].set(jnp.inf)
+    statistics = learner.training.statistics.replace(mean=mean)
+    return learner.replace(training=learner.training.replace(statistics=statistics))
+
+
+def test_what_was_whole_before_is_kept_and_gone_on_from(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(collecting, "CHUNK", 2 * SIZE)
+    stage = Stage.open(tmp_path, "collect", {})
+    with pytest.raises(BadInput, match=r"training/statistics/mean holds NaN or inf\w+ after 512"):
+        gather(Breaking(PREPARED, 4, with_infinity), stage=stage)
+    assert stage.checkpoints().steps() == [2]
+    assert same(gather(stage=stage), undisturbed())
 
 
 def test_interactions_are_counted_once_and_rounded_up(tmp_path: Path) -> None:

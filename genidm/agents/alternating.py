@@ -1,11 +1,12 @@
-"""The iteration that all learners share: every device steps its own lanes, then one learns."""
+"""What all learners share: in an iteration every device steps its own lanes, then one learns."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.struct
 import jax
@@ -13,13 +14,21 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.policy import Activation, Policy
 from genidm.experience import Experience
 from genidm.progress import compiled
-from genidm.tasks import Lanes
+from genidm.robots.base import Robot
+from genidm.tasks import Lanes, Task
 
 
 class Learner(flax.struct.PyTreeNode):
-    """All that is carried from one iteration to the next."""
+    """All that is carried from one iteration to the next.
+
+    Attributes:
+      lanes: the robots.
+      training: what learns. Its `chosen` is what of it chooses actions: (statistics of the
+        inputs, parameters of the policy network).
+    """
 
     lanes: Lanes
     training: Any
@@ -32,7 +41,6 @@ class Alternating:
     Attributes:
       title: what the learner is called in messages.
       start: key → learner.
-      chosen: training state → (statistics, policy): what of it chooses actions.
       walk: (statistics, policy, lanes `[B]`) → (lanes, Experience, what is learned from,
         metrics), all but the lanes `[unroll, B, ...]`.
       learn: (training state, what is learned from) → (training state, losses).
@@ -41,7 +49,6 @@ class Alternating:
 
     title: str
     start: Callable[[jax.Array], Learner]
-    chosen: Callable[[Any], tuple[Any, Any]]
     walk: Callable[..., Any]
     learn: Callable[..., Any]
     mesh: Mesh
@@ -59,7 +66,7 @@ class Alternating:
 
     def acting(self, training: Any) -> tuple[Any, Any]:
         """What chooses actions, a copy on every device."""
-        return devices.put(self.chosen(training), self.mesh, None)
+        return devices.put(training.chosen, self.mesh, None)
 
     def place(self, learner: Learner) -> Learner:
         return Learner(
@@ -82,3 +89,30 @@ class Alternating:
     def learning(self) -> Learning:
         """As `collect` asks for it."""
         return Learning(self.start, self.place, self.prepare)
+
+
+class Alternates(abc.ABC):
+    """Settings of an agent whose iteration is Alternating.
+
+    Attributes:
+      activation: of the policy's hidden layers.
+      hidden: layers of the policy.
+    """
+
+    activation: ClassVar[Activation]
+    hidden: tuple[int, ...]
+
+    @abc.abstractmethod
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
+        """The two programs of an iteration."""
+
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        return self.programs(robot, task, mesh).learning()
+
+    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
+        """The policy of a learner, without exploration."""
+        statistics, params = learner.training.chosen
+        return Policy(
+            params=params, mean=statistics.mean, std=statistics.std, hidden=self.hidden,
+            activation=self.activation, directed=task.directed, robot=robot,
+        )  # fmt: skip

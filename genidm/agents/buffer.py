@@ -6,6 +6,7 @@ episode lies below it in the same column.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -123,6 +124,13 @@ def insert(buffer: Buffer, part: Memory) -> Buffer:
 
     rows = jax.tree.map(write, buffer.rows, part)
     return Buffer(rows, buffer.written + part.last.shape[0])
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def newest(buffer: Buffer, count: int) -> Memory:
+    """The newest rows `[count, B, ...]`, in the order that they were written in."""
+    row = (buffer.written - count + jnp.arange(count)) % buffer.rows.last.shape[0]
+    return jax.tree.map(lambda x: x[row], buffer.rows)
 
 
 def steps_left(buffer: Buffer) -> jax.Array:

@@ -9,15 +9,17 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from genidm import devices
+from genidm import devices, trees
 from genidm.agents.base import Agent, Learning
+from genidm.agents.buffer import Buffer
+from genidm.agents.remembering import Remembering
 from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.experience import Experience, concatenate, load
 from genidm.progress import Progress
 from genidm.robots.base import Robot
 from genidm.store import Stage
-from genidm.tasks import Task, WalkForward
+from genidm.tasks import Lanes, Task, WalkForward
 
 # Transitions that are written to disk at a time.
 CHUNK = 1 << 17
@@ -54,6 +56,9 @@ def collect(
 
     Returns:
       the Experience `[T, lanes, ...]` (None unless kept), and the learner as it ended.
+
+    Raises:
+      BadInput: what the learner has learned is not finite; nothing of that is kept.
     """
     mesh = mesh or devices.dividing(robot.mesh(), agent.lanes)
     _check(agent, interactions, mesh)
@@ -73,6 +78,7 @@ def collect(
             log.add(part)
             bar.advance(size, **{name: np.mean(x) for name, x in metrics.items()})
             if log.full or i + 1 == iterations:
+                _check_learned(learner, (i + 1) * size)
                 log.flush(i + 1, learner)
     return log.experience(), learner
 
@@ -89,6 +95,21 @@ def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
         raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
 
 
+def _check_learned(learner: Any, interactions: int) -> None:
+    """Refuses parameters, or what else is learned, that are not finite."""
+    still = Lanes | Buffer  # robots, and what they did: NaN never gets there
+    learned = jax.tree.map(
+        lambda x: None if isinstance(x, still) else x,
+        learner,
+        is_leaf=lambda x: isinstance(x, still),
+    )
+    if name := trees.not_finite(learned):
+        raise BadInput(
+            f"{name} holds NaN or infinity after {interactions} interactions: what was learned is "
+            "of no use. A smaller learning rate may help"
+        )
+
+
 class _Log:
     """The record so far: on the devices until a chunk is full, then on disk if there is a stage.
 
@@ -100,6 +121,7 @@ class _Log:
         self.waiting = 0
         self.parts: list[Experience] = []
         self.chunks: list[Experience] = []
+        self.checkpoints = Remembering(stage.checkpoints()) if stage else None
 
     @property
     def full(self) -> bool:
@@ -116,15 +138,15 @@ class _Log:
         if self.keep:
             self.chunks.append(concatenate(self.parts))
             self.parts = []
-        if self.stage and self.keep:
-            self.chunks[-1].save(self._path(len(self.chunks) - 1), overwrite=True)
-        if self.stage:
-            state = {"learner": learner, "chunks": len(self.chunks)}
-            self.stage.checkpoints().save(iteration, state)
+            if self.stage:
+                self.chunks[-1].save(self._path(len(self.chunks) - 1), overwrite=True)
+        if self.checkpoints:
+            self.checkpoints.save(iteration, {"learner": learner, "chunks": len(self.chunks)})
 
     def resume(self, learner: Any, learning: Learning) -> tuple[int, Any]:
         """Iterations done, and the learner after them."""
-        found = self.stage and self.stage.checkpoints().latest({"learner": learner, "chunks": 0})
+        like = {"learner": learner, "chunks": 0}
+        found = self.checkpoints and self.checkpoints.latest(like)
         if not found:
             return 0, learner
         iteration, tree = found

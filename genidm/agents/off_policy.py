@@ -11,7 +11,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import flax.struct
 import jax
@@ -22,8 +22,8 @@ from brax.training.types import Transition
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.alternating import Alternating, Learner
-from genidm.agents.base import Learning, Metrics
+from genidm.agents.alternating import Alternates, Alternating, Learner
+from genidm.agents.base import Metrics
 from genidm.agents.buffer import (
     Buffer,
     Memory,
@@ -35,7 +35,7 @@ from genidm.agents.buffer import (
     steps_left,
 )  # fmt: skip
 from genidm.agents.her import HER
-from genidm.agents.policy import Policy, no_statistics
+from genidm.agents.policy import Activation, no_statistics
 from genidm.agents.walking import walk
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
@@ -69,9 +69,14 @@ class TrainingState(flax.struct.PyTreeNode):
     buffer: Buffer
     key: jax.Array
 
+    @property
+    def chosen(self) -> tuple[RunningStatisticsState, Any]:
+        """What chooses actions."""
+        return self.statistics, self.networks.policy
+
 
 @dataclasses.dataclass(frozen=True)
-class OffPolicy(abc.ABC):
+class OffPolicy(Alternates):
     """Settings that off-policy learners share.
 
     Attributes:
@@ -89,6 +94,8 @@ class OffPolicy(abc.ABC):
       critic_hidden: layers of the critics.
       her: relabelling; None learns from the task's own goals and rewards.
     """
+
+    activation: ClassVar[Activation] = "relu"
 
     lanes: int = 128
     unroll: int = 8
@@ -127,18 +134,6 @@ class OffPolicy(abc.ABC):
     def algorithm(self, robot: Robot, size: int) -> Algorithm:
         """The learner's networks and losses, for inputs of this size."""
 
-    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
-        """The policy of a learner, without exploration."""
-        training = learner.training
-        statistics = training.statistics
-        return Policy(
-            params=training.networks.policy, mean=statistics.mean, std=statistics.std,
-            hidden=self.hidden, activation="relu", directed=task.directed, robot=robot,
-        )  # fmt: skip
-
-    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
-        return self.programs(robot, task, mesh).learning()
-
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
         """The two programs of an iteration.
 
@@ -161,10 +156,7 @@ class OffPolicy(abc.ABC):
             _check_room(buffer)
             return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
-        def chosen(training: TrainingState) -> tuple[RunningStatisticsState, Any]:
-            return training.statistics, training.networks.policy
-
-        return Alternating(type(self).__name__, start, chosen, walk, learn, mesh)
+        return Alternating(type(self).__name__, start, walk, learn, mesh)
 
     def _learn(
         self, robot: Robot, task: Task, algorithm: Algorithm, training: TrainingState, part: Memory

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.struct
 import jax
@@ -27,9 +27,9 @@ from brax.training.types import Transition
 from flax import linen
 from jax.sharding import Mesh
 
-from genidm.agents.alternating import Alternating, Learner
-from genidm.agents.base import Learning, Metrics
-from genidm.agents.policy import Policy, no_statistics, normalize
+from genidm.agents.alternating import Alternates, Alternating, Learner
+from genidm.agents.base import Metrics
+from genidm.agents.policy import Activation, no_statistics, normalize
 from genidm.agents.walking import walk
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
@@ -49,9 +49,14 @@ class TrainingState(flax.struct.PyTreeNode):
     statistics: RunningStatisticsState
     key: jax.Array
 
+    @property
+    def chosen(self) -> tuple[RunningStatisticsState, Any]:
+        """What chooses actions."""
+        return self.statistics, self.params.policy
+
 
 @dataclasses.dataclass(frozen=True)
-class PPO:
+class PPO(Alternates):
     """Settings of PPO.
 
     Attributes:
@@ -69,6 +74,8 @@ class PPO:
       value_hidden: layers of the value function.
       max_gradient: gradients are clipped to this norm.
     """
+
+    activation: ClassVar[Activation] = "tanh"
 
     lanes: int = 128
     unroll: int = 16
@@ -106,18 +113,6 @@ class PPO:
             activation=linen.tanh,
         )
 
-    def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
-        """The policy of a learner, without exploration."""
-        training = learner.training
-        statistics = training.statistics
-        return Policy(
-            params=training.params.policy, mean=statistics.mean, std=statistics.std,
-            hidden=self.hidden, activation="tanh", directed=task.directed, robot=robot,
-        )  # fmt: skip
-
-    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
-        return self.programs(robot, task, mesh).learning()
-
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
         """The two programs of an iteration."""
         networks = self.networks(robot, task)
@@ -142,10 +137,7 @@ class PPO:
                 ),
             )
 
-        def chosen(training: TrainingState) -> tuple[RunningStatisticsState, Any]:
-            return training.statistics, training.params.policy
-
-        return Alternating("PPO", start, chosen, walk, learn, mesh)
+        return Alternating("PPO", start, walk, learn, mesh)
 
     def _learn(
         self,

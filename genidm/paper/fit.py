@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from genidm import devices
+from genidm import devices, trees
 from genidm.checks import check, count, layers, number, optional, positive
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
@@ -120,7 +120,8 @@ def fit(
       quiet: no progress bar.
 
     Raises:
-      BadInput: a latent was asked for, and there is only one view.
+      BadInput: a latent was asked for, and there is only one view; or the parameters are not
+        finite any more.
     """
     settings = settings or Fit()
     if settings.latent_size is not None and samples.s.shape[0] < 2:
@@ -139,9 +140,18 @@ def fit(
             learner, info = program(learner, samples, jnp.int32(count))
             done += count
             bar.advance(count, **{name: float(x) for name, x in info.items()})
+            _check_fitted(learner.model, done)
             if checkpoints and checkpoints.due():
                 checkpoints.save(done, learner)
     return learner.model
+
+
+def _check_fitted(model: Controller, updates: int) -> None:
+    if name := trees.not_finite(model):
+        raise BadInput(
+            f"{name} holds NaN or infinity after {updates} updates: what was fitted is of no use. "
+            "A smaller learning rate may help"
+        )
 
 
 def training(

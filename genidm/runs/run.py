@@ -204,16 +204,20 @@ class InverseCell(Cell[Inverse]):
 
     def experience(self) -> Experience:
         """What the agent saw while it learned (§4.1)."""
-        stage = self.experience_stage
-        stage.once(self._collected)
+        stage, made = self.experience_stage, list[Experience]()
+        stage.once(lambda: self._collected(made))
+        if made:
+            return made[0]
         recorded = stage.summary()["recorded"]
         return experience.load_chunks(stage.path("experience"), self.robot, recorded)
 
-    def _collected(self) -> dict[str, Any]:
+    def _collected(self, made: list[Experience]) -> dict[str, Any]:
+        """Collects; what it has in memory then goes into `made`."""
         stage, (agent, before) = self.experience_stage, self._collector()
         record, policy = self._collect(stage, agent, self.scale.interactions - before)
         if policy:
             policy.save(stage.path("policy"), overwrite=True)
+        made.append(record)
         recorded = record.interactions
         return {"interactions": before + recorded, "recorded": recorded}
 
