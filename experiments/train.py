@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from genidm.errors import BadInput
 from genidm.paper import methods
 from genidm.robots import ROBOTS
-from genidm.runs import command as experiment
+from genidm.runs import command
 
 USAGE = "usage: python -m experiments.train --robot ROBOT --method METHOD [flags of a cell]"
 
@@ -43,7 +43,7 @@ def there_are(robot: str | None) -> str:
 
 def main() -> None:
     """Takes `--robot` and `--method` off the command line; the cell reads the rest."""
-    with experiment.in_sentences():
+    with command.in_sentences():
         robot, method, rest = named(sys.argv[1:])
         if robot is None or method is None:
             if {"-h", "--help"} & set(rest):
@@ -54,7 +54,7 @@ def main() -> None:
             raise BadInput(f"no robot is called {robot!r}; {there_are(None)}")
         chosen = methods.by_name(method, robot)
     sys.argv[1:] = rest
-    experiment.main(ROBOTS[robot], chosen)
+    command.main(ROBOTS[robot], chosen)
 
 
 if __name__ == "__main__":

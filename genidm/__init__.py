@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from genidm import engines as engines
+    from genidm import paper as paper
     from genidm import report as report
     from genidm import robots as robots
     from genidm import symmetry as symmetry
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from genidm.evaluation.waypoints import Follow as Follow
     from genidm.evaluation.waypoints import follow as follow
     from genidm.experience import Experience as Experience
-    from genidm.paper import methods as methods
     from genidm.paper.fit import Fit as Fit
     from genidm.paper.fit import fit as fit
     from genidm.paper.generalize import Generalize as Generalize
@@ -81,10 +81,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "symmetry": ("Layout",),
     "errors": ("BadInput",),
 }
-_MODULES = {
-    **{name: name for name in ("engines", "report", "robots", "symmetry", "video")},
-    "methods": "paper.methods",
-}
+_MODULES = ("engines", "paper", "report", "robots", "symmetry", "video")
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [*_HOME, *_MODULES]
@@ -93,7 +90,7 @@ if not TYPE_CHECKING:  # a type checker would take every name for one of these
 
     def __getattr__(name: str) -> Any:
         if name in _MODULES:
-            return import_module(f"genidm.{_MODULES[name]}")
+            return import_module(f"genidm.{name}")
         if name not in _HOME:
             raise AttributeError(f"module 'genidm' has no attribute {name!r}")
         found = getattr(import_module(f"genidm.{_HOME[name]}"), name)

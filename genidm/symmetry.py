@@ -237,7 +237,11 @@ def wrenches(name: str, permutation: Sequence[int]) -> Field:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What an array `[..., n]` holds, field by field, and so how it transforms."""
+    """What an array `[..., n]` holds, field by field, and so how it transforms.
+
+    Attributes:
+      fields: in the order of the numbers.
+    """
 
     fields: tuple[Field, ...]
 

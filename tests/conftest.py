@@ -22,7 +22,7 @@ import small_cells
 from small_cells import Finished
 
 from genidm.robots import Ant
-from genidm.runs import command as experiment
+from genidm.runs import cell as cell_module
 
 
 @pytest.fixture(scope="session")
@@ -55,7 +55,7 @@ def direct(tmp_path_factory) -> Finished:
 def one_bank(monkeypatch) -> None:
     """Cells share the scenarios that are drawn for them."""
     monkeypatch.setattr(
-        experiment, "scenarios", lambda robot, *numbers: small_cells.bank(robot.name, *numbers)
+        cell_module, "scenarios", lambda robot, *numbers: small_cells.bank(robot.name, *numbers)
     )
 
 

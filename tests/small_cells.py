@@ -18,8 +18,8 @@ from tiny import TEST, tiny
 from genidm.evaluation.scenarios import Scenarios, scenarios
 from genidm.paper import methods
 from genidm.paper.methods import Inverse, Method
-from genidm.runs import command as experiment
-from genidm.runs import run as cells
+from genidm.runs import command as command_module
+from genidm.runs import run as run_module
 from genidm.runs.cell import cell, run_cell
 from genidm.runs.resolve import Options
 
@@ -57,7 +57,7 @@ def counted() -> Iterator[Counter]:
 
     with pytest.MonkeyPatch.context() as m:
         for name in STAGES:
-            m.setattr(cells, name, counting(name, getattr(cells, name)))
+            m.setattr(run_module, name, counting(name, getattr(run_module, name)))
         yield calls
 
 
@@ -112,4 +112,4 @@ def command(out: Path, *flags: str, robot: type[Point] = Point, method: Method =
     start = ("cell", "--scale", "0.5", "--episodes", "2", "--out", str(out), *test)
     with pytest.MonkeyPatch.context() as m:
         m.setattr(sys, "argv", [*start, *flags])
-        experiment.main(robot, method)
+        command_module.main(robot, method)

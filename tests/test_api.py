@@ -48,7 +48,7 @@ def test_no_name_is_that_of_a_module_or_of_two_things() -> None:
         p.parent.name for p in package.glob("*/*.py")
     }
     assert not modules & set(NAMES)
-    assert set(genidm._MODULES) - {"methods"} <= modules
+    assert set(genidm._MODULES) <= modules
 
 
 def test_names_stay_what_they_are_whatever_is_imported_first() -> None:

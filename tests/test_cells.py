@@ -21,7 +21,7 @@ from genidm.evaluation.scenarios import scenarios
 from genidm.files import load_arrays
 from genidm.paper.generalize import Generalize
 from genidm.progress import METRICS, read_metrics
-from genidm.runs import run as cells
+from genidm.runs import run as run_module
 from genidm.runs.cell import cell, run_cell
 from genidm.store import Stage
 from genidm.tasks import WalkForward
@@ -136,7 +136,7 @@ def test_one_change_runs_what_depends_on_it_again(
 def test_another_seed_and_another_test_have_stages_of_their_own(copy: Path, monkeypatch) -> None:
     seed = cell(Point(), LR, options(copy, seed=1))
     assert not (seed.experience_stage.done or seed.replay_stage.done or seed.controller_stage.done)
-    monkeypatch.setattr(cells, "run", ran)
+    monkeypatch.setattr(run_module, "run", ran)
     for changes in (dict(episodes=1), dict(test=dataclasses.replace(TEST, reach=0.2))):
         with counted() as calls, pytest.raises(Ran):
             run_cell(Point(), LR, options(copy, **changes))

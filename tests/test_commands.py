@@ -24,8 +24,8 @@ from genidm.files import load_arrays, save_arrays
 from genidm.paper import methods
 from genidm.paper.methods import literal
 from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur, Robot
-from genidm.runs import command as experiment
-from genidm.runs import run as cells
+from genidm.runs import command as command_module
+from genidm.runs import run as run_module
 from genidm.runs.cell import cell
 from genidm.runs.resolve import Options
 from genidm.runs.scale import Scale, scale_of
@@ -98,20 +98,20 @@ def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
 def test_what_the_user_sets_is_what_is_run(
     flags: tuple[str, ...], name: str, value: object, monkeypatch, tmp_path: Path
 ) -> None:
-    ran: list[cells.Cell] = []
+    ran: list[run_module.Cell] = []
     (tmp_path / "table.txt").write_text("")
-    monkeypatch.setattr(experiment, "run_to_the_end", lambda c, _: ran.append(c) or tmp_path)
+    monkeypatch.setattr(command_module, "run_to_the_end", lambda c, _: ran.append(c) or tmp_path)
     monkeypatch.setattr(sys, "argv", ["ant_lr", *flags])
-    experiment.main(Point, methods.LR)
+    command_module.main(Point, methods.LR)
     made = functools.reduce(getattr, name.split("."), ran[0].method)
     assert made == value
 
 
 def test_who_has_set_what_is_said(monkeypatch, tmp_path: Path, capsys) -> None:
     (tmp_path / "table.txt").write_text("")
-    monkeypatch.setattr(experiment, "run_to_the_end", lambda *_: tmp_path)
+    monkeypatch.setattr(command_module, "run_to_the_end", lambda *_: tmp_path)
     monkeypatch.setattr(sys, "argv", ["lr", "--scale", "0.1", "--method.fit.batch", "64"])
-    experiment.main(Point, methods.LR)
+    command_module.main(Point, methods.LR)
     chosen, given, papers = capsys.readouterr().err.splitlines()
     assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
     assert given == "LR, set by you: fit.batch 64 (512)"
@@ -129,7 +129,7 @@ def test_seeds_have_32_bits(seed: float) -> None:
 @pytest.mark.parametrize("robot", [Ant, Humanoid, Minitaur])
 def test_every_method_has_a_command(robot: type[Robot], name: str, monkeypatch) -> None:
     asked: list = []
-    monkeypatch.setattr(experiment, "main", lambda *args: asked.append(args))
+    monkeypatch.setattr(command_module, "main", lambda *args: asked.append(args))
     runpy.run_module(f"experiments.{robot.name}_{name.lower()}", run_name="__main__")
     assert asked == [(robot, methods.by_name(name, robot.name))]
 

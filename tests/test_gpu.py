@@ -22,7 +22,7 @@ from experiments.gpu.results import Results
 from genidm import robots
 from genidm.agents.random import RandomActions
 from genidm.paper import methods
-from genidm.runs import command as experiment
+from genidm.runs import cell as cell_module
 from genidm.runs import run as stages
 from genidm.runs.command import guarded
 
@@ -46,7 +46,7 @@ def small(monkeypatch) -> None:
     monkeypatch.setitem(robots.ROBOTS, "point", Point)
     monkeypatch.setattr(cells, "INTERACTIONS", 512)
     monkeypatch.setattr(cells, "TEST", TEST)
-    for module in (experiment, jobs):
+    for module in (cell_module, jobs):
         monkeypatch.setattr(module, "write_report", reported)
     monkeypatch.setattr(speeds, "FEW_LANES", (4, 8))
     monkeypatch.setattr(speeds, "STEPS", 2)

@@ -9,7 +9,7 @@ import pytest
 from genidm.errors import BadInput
 from genidm.paper.methods import by_name
 from genidm.robots import Minitaur
-from genidm.runs import command as experiment
+from genidm.runs import command
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def test_asking_for_the_minitaur_says_what_to_install(absent: None) -> None:
 def test_its_command_ends_in_one_sentence(absent: None, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["minitaur_rs", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
-        experiment.main(Minitaur, by_name("RS", "minitaur"))
+        command.main(Minitaur, by_name("RS", "minitaur"))
     said = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2
     assert len(said) == 1 and said[0].startswith("error: the Minitaur needs PyBullet")

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import re
 
 import numpy as np
 import pytest
@@ -20,7 +21,18 @@ KEYS = {
     *("interactions", "replayed", "seeds", "episodes", "mean", "std", "ci95", "iqm"),
     *("success", "fell", "settings"),
 }
-ENVIRONMENT = {"versions": {"numpy": np.__version__}, "hardware": "four cores"}
+HERE = {"commit": "a" * 40, "clean": True, "versions": {"numpy": "2.0"}, "hardware": "four cores"}
+CODE = {"genidm.paper.fit": "1111", "genidm.tasks": "2222"}
+
+
+def made(code: dict[str, str] = CODE, **here) -> dict[str, dict]:
+    """What made a row's stages: its fit in two sittings, and its test."""
+    session = HERE | {"command": "python -m experiments.table1"} | here
+    first, last = session | {"seconds": None}, session | {"seconds": 60.0}
+    return {
+        "LR-0-ab": report.origin(code, [first, last]),
+        "test-LR-0-cd": report.origin({}, [last]),
+    }
 
 
 def outcome(mean: float, rng: int = 0, seeds: int = 4, episodes: int = 50) -> Episodes:
@@ -53,17 +65,15 @@ def rows() -> list[report.Row]:
 
 
 def document(rows, robot="ant"):
-    written = report.results(
-        rows, robot=robot, scale="paper", scenarios="ab" * 32, environment=ENVIRONMENT
-    )
+    written = report.results(rows, robot=robot, scale="paper", scenarios="ab" * 32)
     return json.loads(json.dumps(written, allow_nan=False))
 
 
 def test_results_have_the_schema(rows):
     r = document(rows)
-    made = {"robot", "engine", "scale", "scenarios", "versions", "hardware"}
+    made = {"robot", "engine", "scale", "scenarios", "other_code"}
     assert made | {"methods", "paired"} == set(r)
-    assert (r["robot"], r["scale"], r["hardware"]) == ("ant", "paper", "four cores")
+    assert (r["robot"], r["scale"], r["other_code"]) == ("ant", "paper", {})
     for name, method in r["methods"].items():
         several = {"collecting_seeds"} if name in ("GE", "LR") else set()
         assert set(method) == KEYS | EXTRA | several
@@ -494,3 +504,33 @@ def test_the_same_data_makes_the_same_file(rows, tmp_path):
     for name in ("a.png", "b.png"):
         report.violins(rows, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_every_row_says_what_made_it(rows):
+    rows[-1] = dataclasses.replace(rows[-1], made=made())
+    found = document(rows)["methods"]
+    assert not any("made" in found[name] for name in ("RS", "RL", "GE", "LR"))
+    fit, test = found["HF"]["made"].values()
+    assert (fit["commands"], fit["seconds"], test["commands"]) == (2, 60.0, 1)
+    assert {name: fit[name] for name in HERE} == HERE
+    assert re.fullmatch("[0-9a-f]{10}", fit["code"]) and fit["code"] != test["code"]
+
+
+def test_rows_of_one_make_say_it_in_one_sentence(rows):
+    made_alike = [dataclasses.replace(row, made=made()) for row in rows]
+    text = table.markdown(document(made_alike))
+    assert "- Commit: aaaaaaaaaa." in text and "- Versions: numpy 2.0." in text
+    assert "- Hardware: four cores." in text and "different code" not in text
+
+
+def test_rows_of_other_code_and_another_machine_are_named(rows):
+    other = made(CODE | {"genidm.paper.fit": "3333"}, hardware="a GPU", clean=False)
+    mixed = [dataclasses.replace(row, made=other if row.method == "LR" else made()) for row in rows]
+    r = document(mixed)
+    assert r["other_code"] == {
+        "genidm.paper.fit": {"1111": ["RS", "RL", "GE", "HF"], "3333": ["LR"]}
+    }
+    text = table.markdown(r)
+    assert "genidm.paper.fit is 1111 in RS RL GE HF, 3333 in LR." in text
+    assert "Hardware: RS, RL, GE, HF: four cores. LR: a GPU." in text
+    assert "LR: aaaaaaaaaa (changed)" in text

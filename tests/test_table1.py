@@ -27,8 +27,8 @@ from genidm.evaluation.scenarios import scenarios
 from genidm.paper import methods
 from genidm.progress import Progress
 from genidm.report import shown
-from genidm.runs import command as experiment
-from genidm.runs import run as cells
+from genidm.runs import cell as cell_module
+from genidm.runs import run as run_module
 from genidm.runs.command import guarded
 
 # One record for all that learn from one, and one policy.
@@ -49,7 +49,7 @@ def one_bank() -> Iterator[None]:
     """Scenarios are drawn once for all cells: they see the robot and two numbers alone."""
     with pytest.MonkeyPatch.context() as m:
         draw = functools.cache(lambda *numbers: scenarios(Point(), *numbers))
-        m.setattr(experiment, "scenarios", lambda robot, *numbers: draw(*numbers))
+        m.setattr(cell_module, "scenarios", lambda robot, *numbers: draw(*numbers))
         m.setitem(robots.ROBOTS, "point", Point)
         yield
 
@@ -89,7 +89,7 @@ def counted(*names: str) -> Iterator[Counter]:
 
     with pytest.MonkeyPatch.context() as m:
         for name in names:
-            m.setattr(cells, name, counting(name, getattr(cells, name)))
+            m.setattr(run_module, name, counting(name, getattr(run_module, name)))
         yield calls
 
 
@@ -216,14 +216,14 @@ def test_without_a_record_there_is_no_figure_of_invariance(copy: Path) -> None:
 def failing(monkeypatch) -> dict[str, Exception]:
     """Method → what its cells fail with."""
     wrong: dict[str, Exception] = {}
-    episodes = cells.Cell.episodes
+    episodes = run_module.Cell.episodes
 
     def failing(self, *args):
         if self.method.name in wrong:
             raise wrong[self.method.name]
         return episodes(self, *args)
 
-    monkeypatch.setattr(cells.Cell, "episodes", failing)
+    monkeypatch.setattr(run_module.Cell, "episodes", failing)
     return wrong
 
 

@@ -13,7 +13,7 @@ from point import Point
 from experiments import train
 from genidm.paper import methods
 from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur
-from genidm.runs import command as experiment
+from genidm.runs import command
 
 
 def run(*flags: str) -> None:
@@ -23,11 +23,11 @@ def run(*flags: str) -> None:
 
 
 def asked(module: str, *flags: str) -> tuple[Any, ...]:
-    """The robot, the method and the flags that a command gives to `experiment.main`."""
+    """The robot, the method and the flags that a command gives to `command.main`."""
     seen: list[Any] = []
     with pytest.MonkeyPatch.context() as m:
         m.setattr(sys, "argv", ["a command", *flags])
-        m.setattr(experiment, "main", lambda *given: seen.append((*given, sys.argv[1:])))
+        m.setattr(command, "main", lambda *given: seen.append((*given, sys.argv[1:])))
         runpy.run_module(f"experiments.{module}", run_name="__main__")
     (call,) = seen
     return call
