@@ -62,7 +62,7 @@ class Options:
 
     lanes: int = 32
     seed: int = 0
-    out: Path = Path("experiments/results/minitaur_physics.json")
+    out: Path | str = Path("experiments/results/minitaur_physics.json")
 
     def check(self) -> None:
         """Raises BadInput for what cannot be measured."""

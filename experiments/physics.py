@@ -86,7 +86,7 @@ class Options:
     steps: int = 1_000_000
     lanes: int = 128
     seed: int = 0
-    out: Path | None = None
+    out: Path | str | None = None
 
     def check(self) -> None:
         """Raises BadInput for what cannot be measured."""

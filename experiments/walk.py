@@ -14,7 +14,9 @@ from genidm.runs.command import guarded
 
 
 def main(
-    root: Annotated[Path, tyro.conf.Positional], episodes: int = 100, engine: str | None = None
+    root: Annotated[Path | str, tyro.conf.Positional],
+    episodes: int = 100,
+    engine: str | None = None,
 ) -> None:
     """Forward speed of the last policy of every agent that collected under `root`.
 

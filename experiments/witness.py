@@ -176,7 +176,7 @@ def summary(distances: np.ndarray) -> dict[str, float]:
 
 
 def main(
-    out: Path = Path("experiments/results/witness.json"),
+    out: Path | str = Path("experiments/results/witness.json"),
     interactions: int = Ant.paper_interactions,
     episodes: int = 200,
     parts: int = 8,

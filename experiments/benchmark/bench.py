@@ -43,8 +43,8 @@ class Options:
 
     robot: str = "ant"
     engine: str | None = None
-    out: Path | None = None
-    run: Path | None = None
+    out: Path | str | None = None
+    run: Path | str | None = None
     rows: tuple[str, ...] = ()
     seconds: float = 60.0
     lanes: int = PPO().lanes

@@ -48,8 +48,8 @@ class Options:
     """
 
     minutes: float = 9.0
-    results_dir: Path = Path("experiments/results")
-    run_dir: Path = Path("runs/gpu")
+    results_dir: Path | str = Path("experiments/results")
+    run_dir: Path | str = Path("runs/gpu")
     engine: str | None = None
     robots: tuple[str, ...] = ("ant", "humanoid")
     methods: tuple[str, ...] = ()
