@@ -107,6 +107,17 @@ def test_what_ends_before_the_look_ahead_is_left_out() -> None:
         pairs(ROBOT, r, look_ahead=100)
 
 
+def test_a_step_that_is_not_valid_is_no_goal_of_others() -> None:
+    r, look_ahead = record(), 3
+    valid = np.ones((30, 5), bool)
+    valid[[4, 11, 20], [0, 1, 3]] = False
+    goal, exist = map(np.asarray, goal_step(jnp.asarray(r.last), look_ahead))
+    kept = exist & valid & np.take_along_axis(valid, goal, axis=0)
+    assert kept.sum() < (exist & valid).sum()
+    samples = pairs(ROBOT, r.replace(valid=valid), look_ahead=look_ahead)
+    np.testing.assert_array_equal(samples.a, np.asarray(r.a)[kept])
+
+
 @pytest.mark.parametrize("look_ahead", [1, 4, 9])
 @pytest.mark.parametrize("mode", MODES)
 def test_directions_point_to_the_goal_in_every_view(mode: str, look_ahead: int) -> None:
@@ -202,6 +213,12 @@ def test_the_replay_does_not_depend_on_blocks_or_devices(
 def test_another_key_gives_other_yaws() -> None:
     other = replay(ROBOT, record(), jax.random.key(4), Generalize("rotate"), quiet=True)
     assert not np.isin(other.yaw, turned("rotate").yaw).any()
+
+
+def test_exact_turns_are_by_any_yaw() -> None:
+    yaw = np.asarray(turned("rotate", copies=3).yaw).ravel()
+    counts = np.histogram(yaw, 6, (-np.pi, np.pi))[0]
+    assert counts.sum() == 450 and abs(counts - 75).max() < 4 * np.sqrt(75)
 
 
 def test_generalize_is_replay_and_pairs_and_residual_in_one() -> None:

@@ -93,6 +93,15 @@ def test_a_reflection_reverses_turns(field: Field, rng: np.random.Generator) -> 
     assert same(field, field.mirror(field.turn(x, yaw)), field.turn(field.mirror(x), -yaw))
 
 
+def test_what_is_seen_along_the_heading_mirrors_as_the_world_does(rng: np.random.Generator) -> None:
+    """x ahead, y to the left: seen along the mirrored heading, y alone changes its sign."""
+    in_world, yaw = jnp.asarray(rng.normal(size=(LANES, 3))), angles(rng)
+    field = symmetry.heading_vector("velocity")
+    seen = symmetry.turn_vector(in_world, -yaw)
+    across = symmetry.turn_vector(in_world * np.asarray([1, -1, 1]), yaw)
+    assert np.allclose(field.mirror(seen), across, atol=1e-5)
+
+
 @each_field
 def test_a_batch_is_its_lanes(field: Field, rng: np.random.Generator) -> None:
     x, yaw = sample(rng, field), angles(rng)

@@ -22,6 +22,7 @@ from genidm.tasks import (
     Sparse,
     Step,
     WalkForward,
+    ahead,
     input_size,
     inputs,
     outlook,
@@ -123,6 +124,41 @@ def test_headings_and_bearings_can_be_set(yaw: float, bearing: float) -> None:
     seen = np.asarray(wrap(angle - lanes.robots.heading))
     assert yaw + 0.3 < abs(heading).max() < yaw + 0.5 + 1e-5  # half a radian is the point's own
     assert 0.95 * bearing <= abs(seen).max() < bearing + 1e-5
+
+
+def test_a_bearing_is_to_the_left_of_the_heading() -> None:
+    """In complex numbers: o + distance · e^(i (heading + bearing)), at standing height."""
+    rng = np.random.default_rng(0)
+    yaw, bearing = rng.uniform(-3, 3, (2, 20))
+    distance = rng.uniform(1, 5, 20)
+    state = jax.jit(ROBOT.reset)(jax.random.split(jax.random.key(0), 20), jnp.asarray(yaw))
+    goal = ahead(ROBOT, state, jnp.asarray(distance), jnp.asarray(bearing))
+    x, y = state.position[:, 0], state.position[:, 1]
+    expected = x + 1j * y + distance * np.exp(1j * (np.float64(state.heading) + bearing))
+    np.testing.assert_allclose(goal[:, 0] + 1j * goal[:, 1], expected, atol=1e-5)
+    assert (goal[:, 2] == ROBOT.standing_height).all()
+
+
+# ── walking forward ─────────────────────────────────────────────────────────────────────
+
+
+def test_walking_forward_is_worth_what_the_paper_says() -> None:
+    """Metres a second along x, 1 for a step without a fall, less the costs (A.1.1)."""
+    robot, task = Point(speed=4.0, falls_at=0.4, diverges_at=0.5), WalkForward(episode_steps=30)
+    lanes = task.start(robot, jax.random.split(jax.random.key(2), 400))
+    a = jax.random.uniform(jax.random.key(3), (400, 3), minval=-1.0)
+    step_all = jax.jit(robot.step)
+    for _ in range(2):
+        after = step_all(lanes.robots, a)
+        step = task.judge(robot, lanes, a, after)
+        before, lanes = lanes.robots, lanes.replace(robots=after)
+    ahead = (after.position[:, 0] - before.position[:, 0]) / robot.control_step
+    down = np.asarray(after.fallen | after.diverged)
+    assert 20 < down.sum() < 380 and np.asarray(after.diverged).any()
+    np.testing.assert_array_equal(step.terminal, down)
+    expected = ahead + ~down - 0.05 * (np.asarray(a) ** 2).sum(-1)
+    np.testing.assert_allclose(step.reward, expected, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(task.metrics(robot, step)["speed"], ahead, rtol=0, atol=1e-5)
 
 
 # ── where they end ──────────────────────────────────────────────────────────────────────
