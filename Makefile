@@ -3,6 +3,7 @@
 PYTHON ?= python3
 EXTRAS ?= dev
 MINUTES ?= 9
+RESULTS ?= runs/results
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,7 +12,7 @@ NAME_ANOTHER = name one of these, as in: make $(or $(MAKECMDGOALS),.venv) PYTHON
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help .venv demo gpu gpu-wheels check format test test-all clean
+.PHONY: help .venv demo results gpu gpu-wheels check format test test-all clean
 
 help:  ## this list
 	@sed -nE 's/^([.a-z-]+):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
@@ -34,6 +35,23 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
 	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --out runs/demo
+
+# In a directory of its own, where a method has one run. Days on two cores; killed, it goes on.
+results: $(STAMP)  ## every table, figure and number in experiments/results anew, in RESULTS (docs/runs.md)
+	@set -e; \
+	for robot in ant humanoid minitaur; do \
+	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --out $(RESULTS) \
+	    --results experiments/results; \
+	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-* $(RESULTS)/$$robot/GE-0-* \
+	    $(RESULTS)/$$robot/VGCP-0-* $(RESULTS)/$$robot/HF-0-* --reach 1 --out experiments/results; \
+	  $(BIN)/python -m experiments.benchmark --robot $$robot; \
+	done; \
+	$(BIN)/python -m experiments.humanoid_world --out $(RESULTS) --results experiments/results; \
+	$(BIN)/python -m experiments.latent_size --out $(RESULTS) --results experiments/results; \
+	$(BIN)/python -m experiments.physics; \
+	$(BIN)/python -m experiments.physics --robot humanoid; \
+	$(BIN)/python -m experiments.minitaur_physics; \
+	$(BIN)/python -m experiments.witness
 
 gpu: $(STAMP)  ## try, measure and use a GPU for MINUTES=9 (docs/gpu.md; EXTRAS=dev,cuda)
 	$(BIN)/python -m experiments.gpu --minutes $(MINUTES)

@@ -22,6 +22,7 @@ from genidm.runs.cell import announce, bank_of, cell, film_cell, write_report
 from genidm.runs.command import guarded
 from genidm.runs.resolve import Options
 from genidm.runs.run import Cell
+from genidm.store import Stage
 
 Methods = Sequence[Direct | Inverse]
 
@@ -71,10 +72,23 @@ def grouped(methods: Methods) -> list[Direct | Inverse]:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """A cell to run, and what it is tested on."""
+    """A cell to run, and what it is tested on.
+
+    Attributes:
+      cell: what is run.
+      bank: the scenarios of its test.
+      whole: those of the table's rows. Where the cell has been tested on them already, that
+        test stands, so that a table does not depend on which command came first.
+    """
 
     cell: Cell[Any]
     bank: Scenarios
+    whole: Scenarios
+
+    def run(self) -> Stage:
+        """The finished test."""
+        done = self.cell.test_stage(self.whole).done
+        return self.cell.episodes(self.whole if done else self.bank)
 
     def __str__(self) -> str:
         return f"{self.cell.method.name}, training seed {self.cell.seed}"
@@ -89,7 +103,7 @@ def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
     if later and options.spread_episodes < bank.shape[1]:
         few = bank_of(first[0], dataclasses.replace(options, episodes=options.spread_episodes))
     rest = itertools.chain(*later)
-    return [*(Work(this, bank) for this in first), *(Work(this, few) for this in rest)]
+    return [*(Work(this, bank, bank) for this in first), *(Work(this, few, bank) for this in rest)]
 
 
 def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, list[Exception]]:
@@ -111,23 +125,26 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
     """
     todo = work(robot, methods, options)
     announce(robot, options.engine)
-    failures, ended, first = list[Exception](), False, todo[0]
+    failures, tests, ended, first = list[Exception](), list[Stage](), False, todo[0]
     for number, item in enumerate(todo, 1):
         print(f"{item} ({number} of {len(todo)})", file=sys.stderr)
-        error = attempt(item)
-        if error:
-            failures.append(error)
-        rows = error is None and item.bank is first.bank
-        ended |= rows
-        if rows and options.video:
-            film_cell(item.cell)
-    return write_report(first.cell, first.bank, options) if ended else None, failures
+        made = attempt(item)
+        if isinstance(made, Exception):
+            failures.append(made)
+            continue
+        tests.append(made)
+        if item.bank is first.bank:
+            ended = True
+            if options.video:
+                film_cell(item.cell)
+    report = write_report(first.cell, first.bank, options, tests) if ended else None
+    return report, failures
 
 
-def attempt(item: Work) -> Exception | None:
-    """Runs a cell to its end; what it failed with, once that is said on stderr."""
+def attempt(item: Work) -> Stage | Exception:
+    """Runs a cell to its end; or what it failed with, once that is said on stderr."""
     try:
-        item.cell.episodes(item.bank)
+        return item.run()
     except BadInput as error:
         print(f"error: {item}: {error}", file=sys.stderr)
         return error
@@ -135,7 +152,6 @@ def attempt(item: Work) -> Exception | None:
         traceback.print_exc()
         print(f"error: {item} failed", file=sys.stderr)
         return error
-    return None
 
 
 def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:

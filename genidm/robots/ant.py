@@ -8,6 +8,7 @@ import numpy as np
 
 from genidm import symmetry
 from genidm.engines.base import Physics
+from genidm.paper import protocol
 from genidm.robots.base import State
 from genidm.robots.mujoco import ASSETS, MujocoRobot
 from genidm.symmetry import Layout
@@ -35,9 +36,9 @@ class Ant(MujocoRobot):
     frames = 5
     control_step = 0.05
     standing_height = 0.55
-    target_distance = (2.0, 5.0)
+    target_distance = protocol.TARGET_DISTANCE["ant"]
     healthy_height = (0.2, 1.0)
-    paper_interactions = 2_000_000
+    paper_interactions = protocol.INTERACTIONS["ant"]
     # gymnasium's weights of the walking reward.
     alive_bonus = 1.0
     control_cost = 0.5

@@ -12,6 +12,7 @@ import numpy as np
 
 from genidm import symmetry
 from genidm.engines.base import Physics
+from genidm.paper import protocol
 from genidm.robots.base import State
 from genidm.robots.mujoco import ASSETS, MujocoRobot, Solver
 from genidm.symmetry import Layout
@@ -61,9 +62,9 @@ class Humanoid(MujocoRobot):
     frames = 4
     control_step = 0.0165
     standing_height = 1.17
-    target_distance = (2.0, 5.0)
+    target_distance = protocol.TARGET_DISTANCE["humanoid"]
     healthy_height = (0.78, math.inf)
-    paper_interactions = 15_000_000
+    paper_interactions = protocol.INTERACTIONS["humanoid"]
     # PyBullet's weights of the walking reward.
     alive_bonus = 2.0
     electricity_cost = 2.0

@@ -20,6 +20,7 @@ import numpy as np
 from genidm import engines, symmetry
 from genidm.engines.bullet import Bullet
 from genidm.errors import BadInput
+from genidm.paper import protocol
 from genidm.robots import minitaur_world as world
 from genidm.robots.base import Robot, State, select
 from genidm.robots.minitaur_world import ROW, Solver
@@ -121,8 +122,8 @@ class Minitaur(Robot):
     name = "minitaur"
     control_step = world.SUBSTEP * world.SUBSTEPS
     standing_height = 0.2
-    target_distance = (1.5, 2.5)
-    paper_interactions = 4_000_000
+    target_distance = protocol.TARGET_DISTANCE["minitaur"]
+    paper_interactions = protocol.INTERACTIONS["minitaur"]
     # pybullet_envs has none. With a horizon of a second (discount 0.99), a lunge at 1 m/s that
     # ends in a fall would else be worth more than any walk.
     alive_bonus = 0.5

@@ -136,8 +136,8 @@ class Cell(abc.ABC, Generic[M]):
         )
         return record, agent.policy(self.robot, task, learner)
 
-    def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
-        """The test (A.1.3), and the ways of Fig. 8; returns the stage that holds them.
+    def test_stage(self, bank: Scenarios, kind: str = "test") -> Stage:
+        """Where the test on a bank lies.
 
         Args:
           bank: the scenarios.
@@ -147,7 +147,11 @@ class Cell(abc.ABC, Generic[M]):
         source = self.controller_stage.directory.name
         config = {"fit": source, "bank": bank.digest(), "test": self.test}
         code = ("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.controller")
-        stage = self._stage(f"{kind}-{self._label}", config, *code)
+        return self._stage(f"{kind}-{self._label}", config, *code)
+
+    def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
+        """The test (A.1.3), and the ways of Fig. 8; returns `test_stage`, finished."""
+        stage = self.test_stage(bank, kind)
         if not stage.done:
             for note in self.notes:
                 print(note, file=sys.stderr)

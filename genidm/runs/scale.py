@@ -6,6 +6,7 @@ import dataclasses
 
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
+from genidm.paper import protocol
 
 # Interactions up to which an agent has just begun to learn.
 YOUNG = 400_000
@@ -53,7 +54,7 @@ def scale_of(text: str, interactions: int) -> Scale:
       BadInput: it is none of these.
     """
     if text == "paper":
-        return Scale("paper", interactions, 1.0, 10, 1000)
+        return Scale("paper", interactions, 1.0, protocol.TEST_SEEDS, protocol.TEST_EPISODES)
     if text == "quick":
         hurried = PPO(discount=0.97, learning_rate=1e-3, entropy=0.0)
         return Scale(
@@ -70,8 +71,8 @@ def scale_of(text: str, interactions: int) -> Scale:
         name=f"{share:g}",  # by its value: 5e-4 is 0.0005
         interactions=interactions,
         updates=min(share, 1.0),
-        seeds=10,
-        episodes=max(10, round(1000 * min(share, 1.0))),
+        seeds=protocol.TEST_SEEDS,
+        episodes=max(10, round(protocol.TEST_EPISODES * min(share, 1.0))),
         look_ahead=1000 if interactions > YOUNG else 50,
         learning=2 / 3 if share < 1 else 0.0,
     )
