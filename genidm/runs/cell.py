@@ -52,6 +52,7 @@ def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
 def run_to_the_end(this: Cell[Any], options: Options) -> Path:
     """Runs a cell and writes the report of all cells beside it: its directory is returned."""
     announce(this.robot, options.engine)
+    say(this.notes)
     tested = bank_of(this, options)
     stage = this.episodes(tested)
     if options.video:
@@ -136,6 +137,12 @@ def write_report(
         this.robot, this.root, bank, this.scale.name, options.test, options.results,
         own=[stage.directory for stage in own],
     )  # fmt: skip
+
+
+def say(notes: Iterable[str]) -> None:
+    """Says on stderr who set what."""
+    for note in notes:
+        print(note, file=sys.stderr)
 
 
 def announce(robot: Robot, engine: str | None) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -72,7 +71,7 @@ class Cell(abc.ABC, Generic[M]):
       seed: of all that is learned; the test's are fixed.
       root: directory of the stages.
       test: settings of the test.
-      notes: who set what (`resolve.who_set_what`); said when work begins, and stored.
+      notes: who set what (`resolve.who_set_what`), stored with the test.
       other_code: finished stages that other code made are used.
     """
 
@@ -152,9 +151,6 @@ class Cell(abc.ABC, Generic[M]):
     def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
         """The test (A.1.3), and the ways of Fig. 8; returns `test_stage`, finished."""
         stage = self.test_stage(bank, kind)
-        if not stage.done:
-            for note in self.notes:
-                print(note, file=sys.stderr)
         stage.once(lambda: self._tested(stage, bank))
         return stage
 
