@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from genidm.evaluation import sanity
 from genidm.evaluation.evaluate import Test, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.provenance import code_of, command, environment
@@ -37,20 +38,14 @@ def main(
       BadInput: runs of different robots, or none.
     """
     robot, models = saved(runs, engine)
-    bank = scenarios(robot, seeds, episodes, first_seed)
+    bank, rows = scenarios(robot, seeds, episodes, first_seed), []
     here = {**environment(), "command": command()}
     tested = origin(code_of("genidm.evaluation.evaluate", robot, robot.engine), [here])
-    rows = [
-        Row(
-            method=name,
-            episodes=evaluate(robot, model, bank, test),
-            interactions=fitted["interactions"],
-            replayed=fitted["replayed"],
-            settings=fitted["settings"],
-            made={"test": tested},
-        )
-        for name, (model, fitted) in models.items()
-    ]
+    for name, (model, fitted) in models.items():
+        outcome = evaluate(robot, model, bank, test)
+        sanity.walked(name, outcome)
+        told = {key: fitted[key] for key in ("interactions", "replayed", "settings")}
+        rows.append(Row(method=name, episodes=outcome, made={"test": tested}, **told))
     written = results(
         rows,
         robot=robot.name,

@@ -8,8 +8,10 @@ from typing import Annotated
 import tyro
 
 from genidm import controller
+from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import walking_speed
+from genidm.evaluation.scenarios import MOST_EPISODES
 from genidm.runs.command import guarded
 
 
@@ -26,8 +28,9 @@ def main(
       engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
 
     Raises:
-      BadInput: there is none.
+      BadInput: there is none, or no episode.
     """
+    check_value("episodes", episodes, count(1, MOST_EPISODES))
     policies = sorted(Path(root).glob("experience-*/policy"))
     if not policies:
         raise BadInput(f"no agent has collected under {root}: it is to be as runs/ant is")

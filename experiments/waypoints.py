@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from genidm import files
-from genidm.errors import BadInput
+from genidm import checks, files
+from genidm.checks import check_value, count, number
 from genidm.evaluation.waypoints import Follow, Journeys, follow, in_twos
 from genidm.provenance import environment
 from genidm.report import journeys
@@ -46,13 +46,17 @@ def main(
       settings: of a journey.
 
     Raises:
-      BadInput: runs of different robots, or none; waypoints that are none.
+      BadInput: runs of different robots, or none; waypoints that are none; `out` cannot be
+        written.
     """
+    check_value("robots", robots, count(1, 10_000))
+    check_value("yaw", yaw, number())
+    check_value("seed", seed, checks.seed())
+    points = in_twos(waypoints)
+    files.check_writable(out, directory=True)
     robot, models = saved(runs, engine)
-    if robots < 1:
-        raise BadInput(f"robots must be at least 1, not {robots}")
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
-    points, made = in_twos(waypoints), dict[str, Journeys]()
+    made = dict[str, Journeys]()
     for name, (model, _) in models.items():
         made[name] = follow(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")

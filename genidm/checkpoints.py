@@ -75,6 +75,7 @@ class Checkpoints:
         found = (re.fullmatch(r"step_(\d+)", p.name) for p in self.directory.glob("step_*"))
         return sorted(int(m[1]) for m in found if m)
 
+    @files.uninterrupted()
     def save(self, step: int, tree: Any, parts: Sequence[str] = ()) -> None:
         """Keeps a tree of arrays (on any devices), typed random keys and Python numbers.
 

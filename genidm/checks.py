@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from genidm.errors import BadInput
@@ -13,6 +13,8 @@ Allowed = Callable[[Any], str | None]
 
 # Far beyond what any machine does, and far below what numbers of 32 bits hold.
 MOST = 10**8
+# Of a layer of a network.
+WIDEST = 1 << 16
 
 
 def check(settings: Any, called: Mapping[str, str] | None = None, **allowed: Allowed) -> None:
@@ -75,6 +77,28 @@ def number(
     return refuse
 
 
+def seed() -> Allowed:
+    """A seed of 32 bits: jax would take 2³² for 0."""
+    return count(0, 2**32 - 1)
+
+
+def printable(x: Any) -> str | None:
+    """Text that may be printed: not blank, without line breaks or escape codes."""
+    good = isinstance(x, str) and x.strip() and x.isprintable()
+    return None if good else "must be text that can be printed"
+
+
+def label(x: Any) -> str | None:
+    """Text that may be printed, and begin the name of a directory."""
+    return printable(x) or ("must name no path" if "/" in x or x.startswith(".") else None)
+
+
+def shown(x: Any) -> str:
+    """A thing out of somebody's file as it may be printed: without line breaks or escape codes."""
+    text = str(x)
+    return text if text.isprintable() and len(text) <= 200 else f"{text!r:.200}"
+
+
 def _as_float(x: Any) -> float:
     try:
         return float(x)
@@ -92,9 +116,20 @@ def optional(allowed: Allowed) -> Allowed:
     return lambda x: None if x is None else allowed(x)
 
 
+def one_of(things: Collection[Any]) -> Allowed:
+    """One of some things, and of its type: 1 is not True."""
+
+    def refuse(x: Any) -> str | None:
+        if any(type(x) is type(thing) and x == thing for thing in things):
+            return None
+        return f"must be {' or '.join(map(repr, things))}"
+
+    return refuse
+
+
 def layers(x: Any) -> str | None:
     """Widths of the hidden layers of a network."""
-    width = count(1, 1 << 16)
+    width = count(1, WIDEST)
     if not isinstance(x, tuple | list) or len(x) > 100:
         return "must be a list of at most 100 widths"
     return next((f"holds a width that {why}" for why in map(width, x) if why), None)

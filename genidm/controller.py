@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import flax.struct
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 
 from genidm import files, symmetry, trees
 from genidm.agents.policy import Policy, described
+from genidm.checks import WIDEST, check_value, count, layers, one_of, optional, shown
 from genidm.config import plain
 from genidm.errors import BadInput
 from genidm.paper.idm import Architecture
@@ -90,8 +91,8 @@ class Controller(flax.struct.PyTreeNode):
         size = self.robot.observation.size
         return {
             "params": self.architecture.init(key, size),
-            "mean": jnp.zeros(size),
-            "std": jnp.ones(size),
+            "mean": jnp.zeros(size, jnp.float32),
+            "std": jnp.ones(size, jnp.float32),
         }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
@@ -108,7 +109,17 @@ class Controller(flax.struct.PyTreeNode):
 
     @classmethod
     def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Controller:
-        """The controller that `save` wrote, from what lies in its directory."""
+        """The controller that `save` wrote, from what lies in its directory.
+
+        Raises:
+          BadInput: what it says of its models cannot be.
+        """
+        for name, allowed in (
+            ("action_size", count(robot.action.size, robot.action.size)),
+            ("idm", layers), ("lfm", layers), ("latent_size", optional(count(1, WIDEST))),
+            ("frame", one_of(get_args(Frame))),
+        ):  # fmt: skip
+            check_value(name, meta[name], allowed)
         architecture = Architecture(
             meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
         )
@@ -157,16 +168,17 @@ def load(
     tree, meta = files.load_arrays(place)
     if tree.keys() != {"params", "mean", "std"} or not isinstance(meta, dict):
         raise BadInput(f"{path} holds no controller")
-    robot = robot or by_name(meta.get("robot", ""), engine)
-    if meta.get("robot") != robot.name:
-        raise BadInput(f"{path} holds a controller for {meta.get('robot')}, not for {robot.name}")
+    made_for = meta.get("robot")
+    robot = robot or by_name(made_for if isinstance(made_for, str) else "", engine)
+    if made_for != robot.name:
+        raise BadInput(f"{path} holds a controller for {shown(made_for)}, not for {robot.name}")
     _same_layouts(path, meta, robot)
     restore = Policy.restore if "directed" in meta else Controller.restore
     try:
         made = restore(tree, meta, robot)
         wanted = jax.eval_shape(made.fresh, jax.random.key(0))
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{path} holds no controller: {error}") from None
+    except (BadInput, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise BadInput(f"{path} holds no controller: {shown(error)}") from None
     _as_wanted(path, {"params": made.params, "mean": made.mean, "std": made.std}, wanted)
     return made
 
@@ -184,7 +196,10 @@ def _same_layouts(path: Path | str, meta: dict[str, Any], robot: Robot) -> None:
 
 def _fields(listed: Any) -> str:
     try:
-        return ", ".join(f"{name} ({size} × {unit}, {kind})" for name, kind, size, unit in listed)
+        return ", ".join(
+            f"{shown(name)} ({shown(size)} × {shown(unit)}, {shown(kind)})"
+            for name, kind, size, unit in listed
+        )
     except (TypeError, ValueError):
         return "no list of fields"
 

@@ -146,6 +146,11 @@ def memory() -> int | None:
     return stats["bytes_limit"] if stats else None
 
 
+def host_memory() -> int:
+    """Bytes of this machine's memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def at_once(robots: int) -> int:
     """Robots to step at once where no result depends on their number.
 

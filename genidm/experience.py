@@ -82,6 +82,12 @@ class Experience(flax.struct.PyTreeNode):
         last, first = np.asarray(self.last), np.asarray(self.first)
         return last | np.concatenate([first[1:], np.zeros_like(first[:1])])
 
+    @property
+    def begins(self) -> np.ndarray:
+        """`[T, B]` bool, where an episode begins, or the record does."""
+        ends = self.ends
+        return np.concatenate([np.ones_like(ends[:1]), ends[:-1]])
+
     def prepared(self, robot: Robot) -> Experience:
         """The record as 𝒢 and a fit can use it: NumPy arrays, and s as controllers are fed it.
 
@@ -94,16 +100,18 @@ class Experience(flax.struct.PyTreeNode):
             be: numbers that are not finite, actions outside [−1, 1], an orientation that is none,
             positions that jump, episodes that begin where none has ended.
         """
-        made = jax.tree.map(_plain, _named(self))
+        made = _numbers(jax.tree.map(_plain, _named(self)))
         _fitting(made, robot)
         clean = _cleared(made)
         _finite(clean)
         _possible(clean, robot)
         _continuous(clean, robot)
+        _read_otherwise(clean, robot)
         if clean.far_away:
             clean = clean.centred()
         narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
-        return narrow.replace(s=np.asarray(robot.observation.canonical(jnp.asarray(narrow.s))))
+        s = np.asarray(robot.observation.canonical(jnp.asarray(narrow.s)))
+        return narrow.replace(s=s.astype(np.float32, copy=False))
 
     @property
     def far_away(self) -> bool:
@@ -112,11 +120,14 @@ class Experience(flax.struct.PyTreeNode):
 
     def centred(self) -> Experience:
         """Positions that count from the start of each episode, horizontally."""
-        ends, o = self.ends, np.asarray(self.o)
-        begins = np.concatenate([np.ones_like(ends[:1]), ends[:-1]])
+        o = np.asarray(self.o, np.float64)
         rows = np.arange(len(o))[:, None]
-        start = np.maximum.accumulate(np.where(begins, rows, 0), axis=0)
-        origin = np.take_along_axis(o, start[..., None], axis=0) * [1, 1, 0]
+        start = np.maximum.accumulate(np.where(self.begins, rows, 0), axis=0)
+        # The first step that is valid: what others hold is nothing to count from.
+        valid = np.where(np.asarray(self.valid), rows, len(o) - 1)
+        valid = np.minimum.accumulate(valid[::-1], axis=0)[::-1]
+        first = np.take_along_axis(valid, start, axis=0)
+        origin = np.take_along_axis(o, first[..., None], axis=0) * [1, 1, 0]
         return self.replace(o=o - origin, o_next=np.asarray(self.o_next) - origin)
 
 
@@ -135,6 +146,16 @@ def _plain(x: Any) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise BadInput(f"experience: an array holds {array.dtype}, not numbers")
     return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _numbers(made: Experience) -> Experience:
+    """The record with floats of 32 or 64 bits: integers and half floats reckon otherwise."""
+    wide = {
+        name: x.astype(np.float64)
+        for name in ("s", "o", "o_next", "a")
+        if (x := getattr(made, name)).dtype not in (np.float32, np.float64)
+    }
+    return made.replace(**wide)
 
 
 def _named(experience: Experience) -> Experience:
@@ -163,8 +184,10 @@ def _cleared(made: Experience) -> Experience:
 def _fitting(made: Experience, robot: Robot) -> None:
     """Refuses shapes and flags that do not fit together, or the robot."""
     lanes = made.first.shape
-    if len(lanes) != 2 or 0 in lanes:
+    if len(lanes) != 2:
         raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
+    if 0 in lanes:
+        raise BadInput(f"experience: the record is empty: it has {lanes} steps and lanes")
     sizes = {"s": (robot.observation.size,), "o": (3,), "o_next": (3,), "a": (robot.action.size,)}
     for name, size in (sizes | {"last": (), "valid": ()}).items():
         shape = getattr(made, name).shape
@@ -210,17 +233,60 @@ def _continuous(clean: Experience, robot: Robot) -> None:
     if clean.physics is not None:  # a simulation knows where its robots are
         return
     step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
-    usual = np.quantile(step[clean.valid], 0.99)
+    # Not all of the steps: where a position is put right each second, two in a hundred are jumps.
+    usual = np.quantile(step[clean.valid], 0.9)
     most = max(10 * usual, 5.0 * robot.control_step)
-    gap = np.linalg.norm(clean.o[1:] - clean.o_next[:-1], axis=-1) * (both & ~clean.ends[:-1])
-    for name, jump in (("o_next", step), ("o", np.concatenate([0 * gap[:1], gap]))):
-        if (jump > most).any():
-            t, lane = np.unravel_index(jump.argmax(), jump.shape)
+    gap, steps = _gaps(clean)
+    for name, jump, allowed in (("o_next", step, most), ("o", gap, most * steps)):
+        beyond = np.where(jump > allowed, jump, 0)
+        if beyond.any():
+            t, lane = np.unravel_index(beyond.argmax(), jump.shape)
             raise BadInput(
-                f"experience: the position jumps by {jump.max():.3g} m to {name} [{t}, {lane}], "
-                f"where 99 % of the steps are below {usual:.2g} m: end the episode there, or mark "
+                f"experience: the position jumps by {beyond.max():.3g} m to {name} [{t}, {lane}], "
+                f"where 90 % of the steps are below {usual:.2g} m: end the episode there, or mark "
                 "the step as not valid"
             )
+
+
+def _gaps(clean: Experience) -> tuple[np.ndarray, np.ndarray]:
+    """Metres from where the step before ended `[T, B]`, and how many steps before that was.
+
+    The step before is the last valid one of the episode; without one the distance is 0.
+    """
+    rows = np.arange(len(clean.o))[:, None]
+    before = np.maximum.accumulate(np.where(clean.valid, rows, -1), axis=0)
+    before = np.concatenate([np.full_like(before[:1], -1), before[:-1]])
+    episode = np.cumsum(clean.begins, axis=0)
+    at = np.maximum(before, 0)
+    same = (before >= 0) & (np.take_along_axis(episode, at, axis=0) == episode) & clean.valid
+    there = np.take_along_axis(clean.o_next, at[..., None], axis=0)
+    return np.linalg.norm(clean.o - there, axis=-1) * same, rows - before
+
+
+def _read_otherwise(clean: Experience, robot: Robot) -> None:
+    """Refuses an orientation that fits the way that a robot goes only where it is read otherwise.
+
+    Degrees that turn slowly, or (x, y, z, w) of a robot that leans to one side, are numbers that
+    radians and (w, x, y, z) might be. A robot that faces where it goes tells them apart.
+    """
+    way = (clean.o_next - clean.o)[clean.valid]
+    moves = np.linalg.norm(way[:, :2], axis=-1)
+    moves = moves > 0.1 * moves.max()
+    course = np.arctan2(way[:, 1], way[:, 0])[moves]
+    for field, part in zip(
+        robot.observation.fields, robot.observation.parts(clean.s[clean.valid][moves]), strict=True
+    ):
+        if field.otherwise is None or field.yaw is None or not len(course):
+            continue
+        read, words = field.otherwise
+        other = read(part)
+        if other is None:
+            continue
+        here, there = (
+            np.cos(np.asarray(field.yaw(jnp.asarray(x))) - course).mean() for x in (part, other)
+        )
+        if here < 0.5 and there > 0.9:
+            raise BadInput(f"experience: {field.name!r} fits the way of the robot {words} (s)")
 
 
 def record(step: Step) -> Experience:
@@ -278,7 +344,7 @@ def load_chunks(directory: Path, robot: Robot, interactions: int | None = None) 
     if interactions is not None and found != interactions:
         raise Torn(
             f"{directory} holds {found} of {interactions} interactions: a chunk is missing. "
-            f"Delete {directory.parent} to collect it anew"
+            f"Delete {directory.parent} to make it anew"
         )
     return concatenate(chunks)
 

@@ -14,20 +14,25 @@ import functools
 import glob
 import hashlib
 import json
+import math
 import os
 import platform
 import re
 import secrets
 import shutil
+import signal
+import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import jax
 import numpy as np
 
+from genidm.checks import shown
 from genidm.config import plain
 from genidm.errors import BadInput
 
@@ -57,6 +62,25 @@ def disk(path: Path | str) -> Iterator[None]:
         if isinstance(error, OSError):
             raise BadInput(f"cannot use {path}: {error.strerror or error}") from error
         raise
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Holds Ctrl-C back until its end.
+
+    For libraries that write with threads of their own, which say what they think of it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, FrameType | None]] = []
+    before = signal.signal(signal.SIGINT, lambda *what: came.append(what))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+    if came and callable(before):
+        before(*came[0])
 
 
 def _scratch(path: Path, use: str) -> Path:
@@ -133,21 +157,6 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def writable(path: Path | str) -> None:
-    """Refuses a file that cannot be written, and makes its directory: asked before the work.
-
-    Raises:
-      BadInput: why it cannot be. A disk that is full by then is said when it is written.
-    """
-    path = Path(path)
-    with disk(path):
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        scratch = _scratch(path, "new")
-        scratch.touch()
-        scratch.unlink()
-
-
 def save_text(path: Path | str, text: str) -> None:
     """Writes a text file."""
     save_bytes(path, text.encode())
@@ -179,8 +188,36 @@ def load_json(path: Path | str) -> Any:
             return json.loads(Path(path).read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise Torn(f"{path} is missing") from None
-        except ValueError:
+        except (ValueError, RecursionError):
             raise Torn(f"{path} is torn: it is not JSON") from None
+
+
+def check_writable(path: Path | str, directory: bool = False) -> None:
+    """Refuses a path that cannot be written, before the work that it is for.
+
+    Args:
+      path: a file, or a directory to write files to; what lies there is left as it is, and
+        directories that are missing are not made yet.
+      directory: whether it is one.
+
+    Raises:
+      BadInput: it cannot be written, or is a directory where a file is wanted, or the reverse.
+    """
+    path = Path(path)
+    with disk(path):
+        there, missing = (path, "probe") if directory else (path.parent, path.name)
+        if not directory and path.is_dir():
+            raise BadInput(f"cannot use {path}: it is a directory, not a file")
+        # A link to nothing is there, and is not made by mkdir.
+        while not (os.path.lexists(there) or there == there.parent):
+            there, missing = there.parent, there.name
+        if not there.is_dir():
+            raise BadInput(f"cannot use {path}: {there} is not a directory")
+        probe = _scratch(there / missing, "new")
+        try:
+            probe.touch(exist_ok=False)
+        finally:
+            _delete(probe)
 
 
 @contextlib.contextmanager
@@ -321,11 +358,32 @@ def load_arrays(path: Path | str, mmap: bool = False) -> tuple[dict[str, Any], A
             continue
         *parents, name = file.removesuffix(".npy").split(".")
         node: dict[str, Any] = functools.reduce(lambda d, k: d.setdefault(k, {}), parents, tree)
-        try:
-            node[name] = np.load(path / file, mmap_mode="r" if mmap else None, allow_pickle=False)
-        except ValueError as error:
-            raise BadInput(f"{path / file} cannot be read: {error}") from None
+        if not isinstance(node, dict) or name in node:
+            raise BadInput(f"{path} is no tree of arrays: {file} lies inside another array")
+        node[name] = _read(path / file, mmap)
     return tree, load_json(path / "meta.json")
+
+
+def _read(file: Path, mmap: bool) -> np.ndarray:
+    """An array, once its header says no more than there is: it may claim any number of bytes."""
+    try:
+        with file.open("rb") as f:
+            version = np.lib.format.read_magic(f)
+            header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, _, dtype = header(f)
+            there = file.stat().st_size - f.tell()
+        claimed = math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or (claimed != there and not dtype.hasobject):
+            raise ValueError(f"its header claims {shape} of {dtype}, and {there} bytes follow")
+        array: np.ndarray = np.load(file, mmap_mode="r" if mmap else None, allow_pickle=False)
+    except OSError:
+        raise
+    except Exception as error:  # what NumPy's parser raises for a header that is none varies
+        raise BadInput(f"{file} cannot be read: {shown(error)}") from None
+    return array
 
 
 def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

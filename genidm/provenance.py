@@ -28,6 +28,8 @@ from typing import Any
 
 import jax
 
+from genidm.devices import host_memory
+
 PACKAGES = (
     *("genidm", "numpy", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint"),
     *("brax", "mujoco", "mujoco-mjx", "pybullet"),
@@ -182,8 +184,7 @@ def _machine() -> str:
     info = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*:\s*(.+)", info.read_text()) if info.exists() else None
     model = found[1] if found else platform.processor() or platform.machine()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{model}, {os.cpu_count()} cores, {memory:.0f} GiB"
+    return f"{model}, {os.cpu_count()} cores, {host_memory() / 2**30:.0f} GiB"
 
 
 def _commit() -> tuple[str | None, bool | None]:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from genidm.robots.base import Robot, State
 
@@ -27,6 +28,18 @@ class Move(NamedTuple):
     action: jax.Array
     after: State
     notes: Any
+
+
+def narrow(tree: Any) -> Any:
+    """A tree whose float64 is float32: where jax is told to compute with 64 bits, records are not.
+
+    Robots that name no dtypes have states of float64 then.
+    """
+
+    def leaf(x: Any) -> Any:
+        return x.astype(jnp.float32) if x.dtype == jnp.float64 else x
+
+    return jax.tree.map(leaf, tree)
 
 
 # (carry, row) → where the robots are, a [B, A], and notes.

@@ -11,13 +11,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from genidm.checkpoints import Checkpoints
 from genidm.config import digest, plain
 from genidm.errors import BadInput
 from genidm.files import Torn, disk, load_json, remove, save_json
 from genidm.provenance import changed, code_digest, command, environment
+
+T = TypeVar("T")
 
 # Windows has no such locks: there nobody waits for another process.
 fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
@@ -153,6 +155,20 @@ class Stage:
     def finish(self, summary: dict[str, Any]) -> None:
         """Marks the stage as finished; the last thing done to it."""
         save_json(self.path(DONE), summary)
+
+    def read(self, load: Callable[..., T], name: str, *args: Any) -> T:
+        """`load(self.path(name), *args)`, of a stage that is finished or goes on.
+
+        Raises:
+          Torn: it is torn; the message says which directory to delete, for until then the
+            stage stays as it is.
+        """
+        try:
+            return load(self.path(name), *args)
+        except Torn as torn:
+            said = str(torn)
+        delete = f"Delete {self.directory} to make it anew"
+        raise Torn(said if delete in said else f"{said}. {delete}")
 
     def path(self, name: str) -> Path:
         """Where the stage keeps the file or directory `name`."""

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from genidm.checks import printable
 from genidm.errors import BadInput
 
 Array = jax.Array
@@ -86,6 +87,8 @@ class Field:
       yaw: x [..., size] → heading [...], for a field that holds one.
       flaw: x [..., size] on the host → why it cannot be such numbers; None if it can.
       canonical: x [..., size] → the one that stands for it, where several mean the same.
+      otherwise: x [..., size] → what x stands for if it was given in another unit or order, None
+        if it cannot have been; and the words for that. Of a field with a heading.
     """
 
     name: str
@@ -97,6 +100,11 @@ class Field:
     yaw: Callable[[Array], Array] | None = None
     flaw: Callable[[np.ndarray], str | None] | None = None
     canonical: Callable[[Array], Array] | None = None
+    otherwise: tuple[Callable[[np.ndarray], np.ndarray | None], str] | None = None
+
+    def __post_init__(self) -> None:
+        if why := printable(self.name):
+            raise BadInput(f"the name of a field {why}, not {self.name!r:.60}")
 
 
 def _signed(signs: Sequence[float], permutation: Sequence[int] | None = None) -> Mirror:
@@ -144,9 +152,24 @@ def quaternion(name: str) -> Field:
     ROS, PyBullet and scipy have (x, y, z, w).
     """
     mirror = _signed([1, -1, 1, -1])
+    rolled = (_w_last, "where it is read as (x, y, z, w): the order is (w, x, y, z)")
     return Field(
-        name, 4, "quaternion", "1", turn_quaternion, mirror, yaw_of, _no_quaternion, positive
+        name,
+        4,
+        "quaternion",
+        "1",
+        turn_quaternion,
+        mirror,
+        yaw_of,
+        _no_quaternion,
+        positive,
+        rolled,
     )
+
+
+def _w_last(q: np.ndarray) -> np.ndarray | None:
+    """(x, y, z, w) as (w, x, y, z), if what stands first may be an x: that of a slight lean."""
+    return np.roll(q, 1, axis=-1) if (np.abs(q[..., 0]) < 0.2).all() else None
 
 
 def _no_quaternion(q: np.ndarray) -> str | None:
@@ -176,8 +199,14 @@ def euler(name: str) -> Field:
     def turn(x: Array, yaw: Array) -> Array:
         return x.at[..., 2].set(wrap(x[..., 2] + yaw))
 
-    mirror = _signed([-1, 1, -1])
-    return Field(name, 3, "Euler angles", "rad", turn, mirror, lambda x: x[..., 2], _no_euler, wrap)
+    mirror, yaw = _signed([-1, 1, -1]), lambda x: x[..., 2]
+    degrees = (_in_degrees, "where it is read as degrees: the unit is the radian")
+    return Field(name, 3, "Euler angles", "rad", turn, mirror, yaw, _no_euler, wrap, degrees)
+
+
+def _in_degrees(angles: np.ndarray) -> np.ndarray | None:
+    """Degrees as radians, if they may be: more than a full turn."""
+    return np.radians(angles) if (np.abs(angles[..., 2]) > 2 * np.pi).any() else None
 
 
 def _no_euler(angles: np.ndarray) -> str | None:
@@ -269,12 +298,16 @@ class Layout:
         """The field `name` of x `[..., n]`."""
         return dict(zip((f.name for f in self.fields), self._split(x), strict=True))[name]
 
+    def parts(self, x: np.ndarray) -> list[np.ndarray]:
+        """The fields of x `[..., n]` on the host, one after another."""
+        return np.split(x, self._edges, axis=-1)
+
     def flaws(self, x: np.ndarray) -> list[str]:
         """What is wrong with x `[..., n]` on the host, a sentence a field: none if it is sound.
 
         Where the first dimension is time, jumps from one row to the next are seen, too.
         """
-        parts = zip(self.fields, np.split(x, self._edges, axis=-1), strict=True)
+        parts = zip(self.fields, self.parts(x), strict=True)
         said = [(f.name, f.flaw(part) if f.flaw else None) for f, part in parts]
         return [f"{name!r} {flaw}" for name, flaw in said if flaw]
 

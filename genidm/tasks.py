@@ -232,8 +232,9 @@ class GoToGoal:
 
         def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
             far, side = jax.random.split(key)
-            distance = jax.random.uniform(far, minval=low, maxval=high)
-            return distance, jax.random.uniform(side, minval=-self.bearing, maxval=self.bearing)
+            distance = jax.random.uniform(far, (), jnp.float32, low, high)
+            bearing = jax.random.uniform(side, (), jnp.float32, -self.bearing, self.bearing)
+            return distance, bearing
 
         distance, bearing = jax.vmap(draw)(streams[:, 0])
         goal = ahead(robot, robots, distance, bearing)
@@ -291,7 +292,7 @@ def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -
 def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.Array]:
     """Fresh starts of B lanes, turned by up to ± `start_yaw`, and what is left of their keys."""
     streams = jax.vmap(lambda k: jax.random.split(k, 3))(keys)
-    turn = jax.vmap(lambda k: jax.random.uniform(k, minval=-1.0, maxval=1.0))(streams[:, 0])
+    turn = jax.vmap(lambda k: jax.random.uniform(k, (), jnp.float32, -1.0, 1.0))(streams[:, 0])
     return robot.reset(streams[:, 1], start_yaw * turn), streams[:, 2]
 
 

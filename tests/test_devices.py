@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -104,3 +110,55 @@ def test_a_fit_learns_where_its_samples_have_room(monkeypatch):
     model = fit(ROBOT, samples, jax.random.key(0), Fit(updates=2, batch=8, idm=(4,)), quiet=True)
     assert model.mean.devices() == {second}
     assert sizes == [sum(x.nbytes for x in (samples.s, samples.d, samples.a))]
+
+
+# ── any number of devices ───────────────────────────────────────────────────────────────
+
+WORK = """
+import sys, json
+sys.path.insert(0, {tests!r})
+import jax, jax.numpy as jnp, numpy as np
+from point import Point, Straight
+from tiny import AGENTS, TEST
+from genidm.agents.random import RandomActions
+from genidm.agents.collect import collect
+from genidm.evaluation.evaluate import evaluate
+from genidm.paper.generalize import Generalize, generalize
+from genidm.evaluation.scenarios import scenarios
+from genidm.evaluation.waypoints import Follow, follow
+robot = Point()
+straight = Straight(jnp.float32(1.0), robot)
+record, _ = collect(robot, RandomActions(lanes=14, unroll=8), 300, quiet=True)
+pairs, residual = generalize(
+    robot, record, jax.random.key(0), Generalize(segment=6, lanes=10), look_ahead=5)
+found = evaluate(robot, straight, scenarios(robot, 1, 7), TEST, quiet=True)
+made = follow(robot, straight, [[1.0, 0.0]], jax.random.split(jax.random.key(0), 7),
+    np.zeros(7), settings=Follow(40, chunk=10), quiet=True)
+print(json.dumps(dict(
+    devices=jax.device_count(), s=np.abs(record.s).sum(), steps=record.interactions,
+    d=np.abs(pairs.d).sum(), residual=residual["median"].max(),
+    closest=found.closest.sum(), arrival=made.arrival.ravel().tolist()), default=float))
+"""
+
+
+@functools.cache
+def at_work(count: int) -> dict:
+    """What comes of 14 lanes, 10 segments at once, 7 episodes and 7 journeys on so many devices."""
+    here = Path(__file__).parent
+    made = subprocess.run(
+        [sys.executable, "-c", WORK.format(tests=str(here))], capture_output=True, text=True,
+        env=os.environ | {"GENIDM_DEVICES": str(count), "PYTHONPATH": str(here.parent)},
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr[-3000:]
+    return json.loads(made.stdout)
+
+
+@pytest.mark.parametrize("count", [3, 5, 6, 12])
+def test_devices_that_divide_nothing_change_nothing(count: int) -> None:
+    one, many = at_work(1), at_work(count)
+    assert one["devices"] == 1 and many["devices"] == count
+    assert one["steps"] == 336 and -1 not in one["arrival"]
+    assert many["arrival"] == one["arrival"]
+    for name in ("s", "steps", "d", "residual", "closest"):
+        x = many[name]
+        np.testing.assert_allclose(x, one[name], rtol=1e-4, atol=1e-5, err_msg=name)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from genidm.checkpoints import Checkpoints
 
 ROOT = Path(__file__).parents[1]
 
@@ -71,6 +76,81 @@ def test_a_variable_that_is_no_number_is_said_in_a_sentence(name: str, value: st
     assert made.stderr.startswith(f"error: {name} is a number of ") and made.stderr.count("\n") == 1
 
 
+SAVING = """
+import sys, numpy as np
+from genidm.runs.command import guarded
+from genidm.checkpoints import Checkpoints
+where = sys.argv.pop()
+def run() -> None:
+    kept = Checkpoints(where)
+    tree = {f"a{i}": np.ones((300, 1000), np.float32) for i in range(8)}
+    for step in range(10_000):
+        kept.save(step, tree)
+        if not step:
+            print("began", flush=True)
+guarded(run, "A command.")
+"""
+
+
+def interrupted(command: list[str], ready: bool, seconds: float) -> tuple[int, str]:
+    """Exit status and stderr of a command that gets Ctrl-C."""
+    made = subprocess.Popen(
+        [sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=ROOT,
+    )  # fmt: skip
+    assert made.stdout
+    if ready:
+        assert made.stdout.readline() == "began\n"
+    time.sleep(seconds)
+    made.send_signal(signal.SIGINT)
+    return made.returncode if made.poll() else made.wait(60), made.communicate()[1]
+
+
+@pytest.mark.parametrize("seconds", [0.01, 0.06, 0.11])
+def test_ctrl_c_in_a_checkpoint_is_a_sentence_and_leaves_it_whole(
+    tmp_path: Path, seconds: float
+) -> None:
+    said = "stopped: the same command goes on where it was\n"
+    assert interrupted(["-c", SAVING, str(tmp_path)], True, seconds) == (130, said)
+    assert all(path.name.startswith("step_") for path in tmp_path.iterdir())
+    latest = Checkpoints(tmp_path).latest(
+        {f"a{i}": np.ones((300, 1000), np.float32) for i in range(8)}
+    )
+    assert latest and (latest[1]["a7"] == 1).all()
+
+
+def test_ctrl_c_while_a_command_is_read_in_is_a_sentence(tmp_path: Path) -> None:
+    # A module that takes its time stands in for the seconds that jax takes.
+    (tmp_path / "tyro.py").write_text("import time\nprint('began', flush=True)\ntime.sleep(60)")
+    stand_in = (
+        f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); sys.argv = ['-m']; "
+        "runpy.run_module('experiments.ant_lr', run_name='__main__', alter_sys=False)"
+    )
+    said = "stopped: nothing had begun\n"
+    assert interrupted(["-c", stand_in], True, 0.0) == (130, said)
+
+
+def test_an_error_from_inside_a_program_is_a_sentence() -> None:
+    inside = COMMAND.replace(
+        "    print(",
+        "    import jax, jax.numpy as jnp\n"
+        "    from genidm.errors import BadInput\n"
+        "    def ask(x):\n        raise BadInput('no worker starts')\n"
+        "    y = jax.jit(lambda x: jax.pure_callback(ask, x, x))(jnp.ones(3)); print(y); print(",
+    )
+    made = python(inside)
+    assert (made.returncode, made.stdout) == (2, "")
+    assert made.stderr.splitlines()[-1] == "error: no worker starts"
+
+
+def test_more_memory_than_there_is_is_a_sentence() -> None:
+    huge = COMMAND.replace(
+        "print(", "import jax.numpy as jnp; print(jnp.zeros(10**14).sum()); print("
+    )
+    made = python(huge)
+    assert made.returncode == 2 and made.stderr.splitlines()[-1].startswith("error: not enough mem")
+
+
 @pytest.mark.parametrize("name", ["GENIDM_DEVICES", "GENIDM_CHECKPOINT_SECONDS"])
 def test_an_empty_variable_counts_as_not_set(name: str) -> None:
     made = python(COMMAND, **{name: ""})
@@ -96,3 +176,12 @@ def test_output_into_something_that_ends_is_no_traceback() -> None:
         ["bash", "-c", shell], env=env | {"CODE": many}, capture_output=True, text=True
     )
     assert made.stdout == "x" * 1000 + "\n" and made.stderr == ""
+
+
+@pytest.mark.parametrize("said", [COMMAND, f"import sys; sys.argv.append('--help')\n{COMMAND}"])
+def test_output_that_nobody_reads_is_no_traceback_either(said: str) -> None:
+    """So short that it is only written at the end."""
+    shell = f'"{sys.executable}" -c "$CODE" | true; echo "${{PIPESTATUS[0]}}"'
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "CODE": f"import time; time.sleep(0.2)\n{said}"}
+    made = subprocess.run(["bash", "-c", shell], env=env, capture_output=True, text=True)
+    assert (made.stdout, made.stderr) == ("2\n", "")

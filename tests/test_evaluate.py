@@ -18,7 +18,7 @@ from genidm import checkpoints, devices
 from genidm.errors import BadInput
 from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluate import Test, evaluate, flatten, run
+from genidm.evaluation.evaluate import Test, evaluate, flatten, run, walking_speed
 from genidm.evaluation.scenarios import Scenarios, scenarios, tours
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import State
@@ -208,6 +208,44 @@ def same(a: Scenarios, b: Scenarios) -> bool:
 
 def numbers(bank: Scenarios) -> list[np.ndarray]:
     return [np.asarray(x) for x in (jax.random.key_data(bank.keys), bank.yaw, bank.target)]
+
+
+@pytest.mark.parametrize(
+    ("answer", "given"),
+    [
+        (lambda s, way: way[:, :2], r"float32\[\d+, 2\]"), (lambda s, way: way[:, :1], "float32"),
+        (lambda s, way: way.sum(), r"float32\[\]"), (lambda s, way: None, "None"),
+        (lambda s, way: way > 0, r"bool\[\d+, 3\]"),
+    ],
+)  # fmt: skip
+def test_a_controller_that_answers_something_else_is_refused(answer, given: str) -> None:
+    with pytest.raises(BadInput, match=rf"the controller must answer .* not {given}"):
+        evaluate(Point(), answer, bank(), Test(**FAST), quiet=True)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        dict(seeds=10**30), dict(episodes=10**30), dict(seeds=10**4, episodes=10**4),
+        dict(episodes=1.5), dict(first_seed=-1), dict(first_seed=2**32 - 1), dict(first_seed=2**70),
+        dict(first_seed=0.5), dict(seeds=True),
+    ],
+)  # fmt: skip
+def test_a_bank_of_no_such_numbers_is_refused(wrong: dict) -> None:
+    with pytest.raises(BadInput, match=r"(seeds?|episodes) of a test must"):
+        scenarios(Point(), **({"seeds": 2, "episodes": 2} | wrong))
+
+
+def test_seeds_go_up_to_32_bits() -> None:
+    last = scenarios(Point(), 2, 3, first_seed=2**32 - 2)
+    assert not same(last, scenarios(Point(), 2, 3)) and len(np.unique(last.yaw)) == 6
+    assert same(jax.tree.map(lambda x: x[1:], last), scenarios(Point(), 1, 3, first_seed=2**32 - 1))
+
+
+@pytest.mark.parametrize("wrong", [dict(episodes=0), dict(episodes=10**12), dict(seed=2**32)])
+def test_how_fast_nobody_walks_is_not_told(wrong: dict) -> None:
+    with pytest.raises(BadInput, match=rf"{next(iter(wrong))} must"):
+        walking_speed(Point(), Straight(jnp.float32(1.0), Point()), **wrong)
 
 
 def test_a_bank_is_a_function_of_robot_and_seed_alone() -> None:

@@ -163,6 +163,99 @@ def test_pickle_is_not_loaded_even_with_a_true_manifest(tmp_path: Path) -> None:
             load_arrays(tmp_path / "x", mmap=mmap)
 
 
+def claim(file: Path, shape: tuple[int, ...], dtype: str = "<f4") -> None:
+    """Writes a header that claims an array of this shape before 64 bytes."""
+    with file.open("wb") as f:
+        header = {"descr": dtype, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(f, header)
+        f.write(bytes(64))
+
+
+def believed(directory: Path, name: str) -> None:
+    """Makes the manifest say that a file is as it should be."""
+    manifest = files.load_json(directory / "manifest.json")
+    files.save_json(
+        directory / "manifest.json", {**manifest, name: files._measure(directory / name)}
+    )
+
+
+@pytest.mark.parametrize("mmap", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "dtype"),
+    [((10**13,), "<f4"), ((10**6, 10**7), "<f4"), ((2**62, 4), "<f4"), ((17,), "<f4"),
+     ((15,), "<f4"), ((-4, -4), "<f4"), ((10**13,), "|O"), ((2,), "<U9999999")],
+)  # fmt: skip
+def test_a_header_that_claims_what_is_not_there_is_refused_before_anything_is_allocated(
+    tmp_path: Path, shape: tuple[int, ...], dtype: str, mmap: bool
+) -> None:
+    save_arrays(tmp_path / "x", {"a": np.ones(1)}, {})
+    claim(tmp_path / "x" / "a.npy", shape, dtype)
+    believed(tmp_path / "x", "a.npy")
+    with pytest.raises(BadInput, match=r"a\.npy cannot be read"):
+        load_arrays(tmp_path / "x", mmap=mmap)
+    claim(tmp_path / "x" / "a.npy", (16,))
+    believed(tmp_path / "x", "a.npy")
+    assert load_arrays(tmp_path / "x", mmap=mmap)[0]["a"].shape == (16,)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"text", b"\x93NUMPY\x09\x00", b"\x93NUMPY\x01\x00\x05\x00{[(("]
+)
+def test_what_is_no_array_is_refused(tmp_path: Path, content: bytes) -> None:
+    save_arrays(tmp_path / "x", {"a": np.ones(1)}, {})
+    (tmp_path / "x" / "a.npy").write_bytes(content)
+    believed(tmp_path / "x", "a.npy")
+    with pytest.raises(BadInput, match=r"a\.npy cannot be read"):
+        load_arrays(tmp_path / "x")
+
+
+def test_an_array_inside_an_array_is_refused(tmp_path: Path) -> None:
+    save_arrays(tmp_path / "x", {"a": {"b": np.ones(1)}}, {})
+    np.save(tmp_path / "x" / "a.npy", np.ones(2))
+    believed(tmp_path / "x", "a.npy")
+    with pytest.raises(BadInput, match="no tree of arrays"):
+        load_arrays(tmp_path / "x")
+
+
+def test_json_nested_without_end_is_torn(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("[" * 10**6)
+    with pytest.raises(Torn, match="not JSON"):
+        files.load_json(tmp_path / "x.json")
+
+
+# --- what cannot be written ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["x.json", "new/x.json", "a/b/c/x.json", "."])
+def test_what_can_be_written_is_and_nothing_is_left_of_the_trial(tmp_path: Path, path: str) -> None:
+    files.check_writable(tmp_path / path, directory=True)
+    if path != ".":
+        files.check_writable(tmp_path / path)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "here.json").write_text("1")
+    files.check_writable(tmp_path / "here.json")
+    assert (tmp_path / "here.json").read_text() == "1" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("directory", [False, True])
+@pytest.mark.parametrize(
+    "path", ["/proc/x/y", "file/x", "file/a/b", "link/x", "n" * 300, "n" * 300 + "/x"]
+)
+def test_what_cannot_be_written_is_refused(tmp_path: Path, path: str, directory: bool) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(BadInput, match="cannot use"):
+        files.check_writable(tmp_path / path, directory)
+
+
+def test_a_file_is_no_directory_and_a_directory_no_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="not a directory"):
+        files.check_writable(tmp_path / "file", directory=True)
+    with pytest.raises(BadInput, match="is a directory, not a file"):
+        files.check_writable(tmp_path)
+
+
 # --- full disks ------------------------------------------------------------------------
 
 

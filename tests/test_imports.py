@@ -50,7 +50,7 @@ evaluation.scenarios
 evaluation.evaluator
 evaluation.evaluate
 evaluation.invariance evaluation.waypoints
-evaluation.stats
+evaluation.stats evaluation.sanity
 report.rows
 report.table report.drawing
 report.figures report.journeys

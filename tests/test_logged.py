@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -281,6 +282,43 @@ def spoil(directory: Path, name: str, change) -> None:
         (lambda x: x.astype("U3"), "is <U3"),
     ],
 )
+def foreign(directory: Path, **changes: Any) -> None:
+    """Changes what a controller's directory says of it, and makes its manifest say so."""
+    meta = files.load_json(directory / "meta.json") | changes
+    files.save_json(directory / "meta.json", meta)
+    manifest = files.load_json(directory / "manifest.json")
+    measured = files._measure(directory / "meta.json")
+    files.save_json(directory / "manifest.json", manifest | {"meta.json": measured})
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        (dict(idm=[8, 0]), "idm holds a width"), (dict(idm=[-1]), "idm holds a width"),
+        (dict(lfm=[10**30]), "lfm holds a width"), (dict(idm="8"), "idm must be a list"),
+        (dict(idm=[8] * 999), "idm must be a list"), (dict(lfm=[8.5]), "lfm holds a width"),
+        (dict(latent_size=10**18), "latent_size must be at most"),
+        (dict(latent_size=-1), "latent_size must be at least"),
+        (dict(latent_size=3), "where its architecture has"),
+        (dict(action_size=3), "action_size must be"), (dict(frame="body"), "frame must be"),
+        (dict(frame=None), "frame must be"), (dict(robot=None), "a controller for None"),
+        (dict(robot=["mine"]), "a controller for"),
+        (dict(robot="a\x1b[2J\nb"), r"for 'a\\x1b\[2J\\n"),
+        (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\) there"),
+        (dict(observation=7), "no list of fields there"),
+    ],
+)  # fmt: skip
+def test_what_a_controllers_directory_says_may_be_anything(
+    tmp_path: Path, changes: dict, why: str
+) -> None:
+    model = fit(Mine(), samples(Mine(), log()), jax.random.key(1), tiny(LR).fit, quiet=True)
+    model.save(tmp_path / "controller")
+    foreign(tmp_path / "controller", **changes)
+    with pytest.raises(BadInput, match=why) as refused:
+        controller.load(tmp_path / "controller", Mine())
+    assert str(refused.value).isprintable()
+
+
 def test_parameters_that_do_not_fit_the_architecture_are_refused(
     tmp_path: Path, change, why: str
 ) -> None:
@@ -298,3 +336,170 @@ def test_a_controller_is_not_asked_with_what_is_not_finite() -> None:
     for wrong in ((s * np.nan, way), (s, way * np.inf)):
         with pytest.raises(BadInput, match="holds NaN or infinity"):
             model(*wrong)
+
+
+# ── more of the same kinds ──────────────────────────────────────────────────────────────
+
+
+def test_episodes_given_by_their_first_steps_alone_are_refused() -> None:
+    first = with_("first", ([0, 20, 40], slice(None)), True)
+    with pytest.raises(BadInput, match=r"step \[20, 0\] begins an episode, where none has ended"):
+        ways(dataclasses.replace(log(), first=first, last=np.zeros_like(first)))
+
+
+def test_a_jump_behind_steps_that_are_not_valid_is_refused() -> None:
+    """They were carried in that time: what follows is no way to go for what was before."""
+    aside = np.zeros((60, 3, 3), np.float32)
+    aside[30:, 1, 0] = 3.0
+    gap = dict(valid=with_("valid", (slice(27, 30), 1), False))
+    moved = dataclasses.replace(log(), o=log().o + aside, o_next=log().o_next + aside, **gap)
+    with pytest.raises(BadInput, match=r"jumps by 3.* m to o \[30, 1\]"):
+        ways(moved)
+    assert headings(ways(dataclasses.replace(log(), **gap))) == [-1, 0, 1]
+    ended = dict(first=with_("first", (30, 1), True), last=with_("last", (29, 1), True))
+    assert headings(ways(dataclasses.replace(moved, **ended))) == [-1, 0, 1]
+
+
+def test_jumps_that_come_each_second_are_jumps() -> None:
+    """Two steps in a hundred: an outlier is not what most of the largest are."""
+    o = np.cumsum(np.full((300, 1, 3), [0.02, 0, 0]), axis=0)
+    o[:, 0, 1] = 0.4 * (np.arange(300) // 50 % 2)
+    one = jax.tree.map(lambda x: np.repeat(x[:1, :1], 300, axis=0), log())
+    o_next = np.append(o[1:], o[-1:] + np.asarray([0.02, 0, 0]), axis=0)
+    first, last = (np.arange(300)[:, None] == t for t in (0, 299))
+    with pytest.raises(BadInput, match=r"jumps by 0\.4.* m to o_next \[\d*9, 0\]"):
+        ways(one.replace(o=o, o_next=o_next, first=first, last=last))
+
+
+def test_steps_that_are_not_valid_are_counted_and_may_be_infinite() -> None:
+    gone = dataclasses.replace(
+        log(), valid=with_("valid", (7, 2), False), o_next=with_("o_next", (7, 2), np.inf)
+    )
+    with pytest.warns(
+        UserWarning, match=r"1 of 180 steps are not valid and left out, first \[7, 2\]"
+    ):
+        assert headings(ways(gone)) == [-1, 0, 1]
+
+
+def test_positions_far_away_count_from_the_first_step_that_is_valid() -> None:
+    north = np.asarray([448_251.7, 5_411_932.3, 35.0])
+    o, o_next = (np.float64(x) + north for x in (log().o, log().o_next))
+    o[:3, 1] = np.nan
+    valid = with_("valid", (slice(0, 3), 1), False)
+    far = dataclasses.replace(log(), o=o, o_next=o_next, valid=valid)
+    near = dataclasses.replace(log(), valid=valid)
+    np.testing.assert_allclose(ways(far), ways(near), atol=1e-5)
+    rotate = Generalize(mode="rotate")
+    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, look_ahead=20)
+    assert residual["p90"].max() < 1e-5
+
+
+class Counting(Mine):
+    name = "counting"
+    observation = Layout((symmetry.invariant("touches", 2), symmetry.vector("velocity", "m/s")))
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, np.float16, np.longdouble])
+def test_numbers_of_any_kind_are_learned_from_as_floats(dtype: Any) -> None:
+    s = np.random.default_rng(0).integers(0, 2, (60, 3, 5)).astype(dtype)
+    a = np.zeros((60, 3, 2), dtype)
+    made, same = (
+        samples(Counting(), dataclasses.replace(log(), s=s.astype(kind), a=a.astype(kind)))
+        for kind in (dtype, np.float32)
+    )
+    assert made.s.dtype == made.a.dtype == np.float32
+    np.testing.assert_array_equal(made.s, same.s)
+
+
+def test_positions_in_whole_numbers_go_backwards_too() -> None:
+    """Unsigned integers have no difference below 0."""
+    back = np.arange(60, 0, -1, dtype=np.uint8)
+    o = np.zeros((60, 3, 3), np.uint8)
+    o[..., 0] = back[:, None]
+    after = o - np.asarray([1, 0, 0], np.uint8)
+    d = ways(dataclasses.replace(log(), o=o, o_next=after))[0]
+    np.testing.assert_allclose(d, np.broadcast_to([-1.0, 0.0, 0.0], d.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("change", [lambda x: x[::-1][::-1], lambda x: np.asfortranarray(x)])
+def test_arrays_laid_out_otherwise_are_the_same(change) -> None:
+    odd = jax.tree.map(change, log())
+    np.testing.assert_array_equal(ways(odd), ways(log()))
+
+
+def test_an_empty_record_is_said_to_be_empty() -> None:
+    for cut in (np.s_[:0], np.s_[:, :0]):
+        with pytest.raises(BadInput, match="the record is empty"):
+            ways(jax.tree.map(lambda x, cut=cut: x[cut], log()))
+
+
+def test_a_record_of_one_step_is_learned_from() -> None:
+    one = jax.tree.map(lambda x: x[:1], log())
+    one = dataclasses.replace(one, last=~one.valid | True)
+    assert ways(one, look_ahead=1).shape == (2, 3, 3)
+    with pytest.raises(BadInput, match="no episode lasts look_ahead = 2 steps"):
+        ways(one, look_ahead=2)
+
+
+@pytest.mark.parametrize("wrong", [1.5, 0, -1, True, "20", np.nan, 10**30, None])
+def test_a_look_ahead_that_is_no_number_of_steps_is_refused(wrong: Any) -> None:
+    with pytest.raises(BadInput, match="look_ahead must be"):
+        ways(log(), look_ahead=wrong)
+
+
+def walking(yaw: np.ndarray, aside: float = 0.0) -> tuple[Experience, np.ndarray]:
+    """A log of walking along `yaw [T]` (radians), and a slight lean `[T, B]`."""
+    heading = np.tile(yaw[:, None], (1, 3))
+    zero = np.zeros_like(heading)
+    course = heading + aside
+    way = np.cumsum(0.02 * np.stack([np.cos(course), np.sin(course), zero], -1), 0)
+    step = np.diff(way, axis=0, prepend=0 * way[:1])
+    first, last = np.zeros((2, *heading.shape), bool)
+    first[0], last[-1] = True, True
+    lean = np.abs(np.random.default_rng(0).normal(0.02, 0.01, heading.shape))
+    made = Experience(
+        s=None, o=way - step, o_next=way, a=np.zeros((*heading.shape, 2)), first=first, last=last,
+        valid=~last | True,
+    )  # fmt: skip
+    return made, lean
+
+
+@pytest.mark.parametrize("aside", [0.0, np.pi / 2, np.pi])
+def test_degrees_that_turn_slowly_are_refused_and_radians_are_not(aside: float) -> None:
+    yaw = np.linspace(0, 4 * np.pi, 600)
+    made, lean = walking(yaw, aside)
+    heading = np.tile(yaw[:, None], (1, 3))
+    velocity = np.zeros((600, 3, 3))
+    s = np.concatenate([np.stack([lean, lean, heading], -1), velocity], -1)
+    samples(Euler(), made.replace(s=s))
+    if aside:  # who goes sideways does not tell them apart
+        return
+    s[..., :3] = np.degrees(s[..., :3])
+    s[..., :2] = np.clip(s[..., :2], -1.5, 1.5)
+    assert np.abs(np.diff(s[..., 2], axis=0)).max() < 2 and s.max() > 719
+    with pytest.raises(BadInput, match=r"'orientation' fits .* degrees: the unit is the radian"):
+        samples(Euler(), made.replace(s=s))
+
+
+@pytest.mark.parametrize("aside", [0.0, np.pi / 2, np.pi])
+def test_ros_quaternions_of_a_robot_that_leans_are_refused_and_others_are_not(aside: float) -> None:
+    yaw = 0.5 * np.sin(np.linspace(0, 9, 600))
+    made, lean = walking(yaw, aside)
+    w, z = np.cos(yaw / 2)[:, None] + 0 * lean, np.sin(yaw / 2)[:, None] + 0 * lean
+    q = np.stack([w, lean, 0 * lean, z], -1)
+    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    velocity = np.zeros((600, 3, 3))
+    samples(Mine(), made.replace(s=np.concatenate([q, velocity], -1)))
+    if aside == 0:
+        ros = np.concatenate([q[..., [1, 2, 3, 0]], velocity], -1)
+        with pytest.raises(BadInput, match=r"the order is \(w, x, y, z\)"):
+            samples(Mine(), made.replace(s=ros))
+
+
+@pytest.mark.parametrize("wrong", ["a\nb", "\x1b[2J", "  ", "", "a/b", ".hidden", 7, None])
+def test_names_that_reach_a_terminal_or_a_path_are_checked(wrong: Any) -> None:
+    with pytest.raises(BadInput, match="the name of a robot must"):
+        type("Wrong", (Mine,), {"name": wrong})
+    if wrong not in ("a/b", ".hidden"):  # of a field nothing is named
+        with pytest.raises(BadInput, match="the name of a field must"):
+            symmetry.vector(wrong)

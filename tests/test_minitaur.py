@@ -418,3 +418,57 @@ def test_the_drawing_lies_as_pybullet_has_it(minitaur: Minitaur, starts: State) 
             there = bullet.getLinkState(body, link, computeForwardKinematics=1)[4]
             np.testing.assert_allclose(data.body(name).xpos, there, atol=1e-5)
     live.close()
+
+
+# ── what MinitaurEnv is given, and what becomes of it ───────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    from genidm.robots.minitaur_env import MinitaurEnv
+
+    made = MinitaurEnv()
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        np.full(8, np.nan), np.r_[np.zeros(7), np.inf], np.zeros(7), np.zeros((1, 8)), 0.0,
+        np.zeros(0), [None] * 8, "forwards",
+    ],
+    ids=str,
+)  # fmt: skip
+def test_an_action_that_is_none_is_refused_and_changes_nothing(env: Any, action: Any) -> None:
+    env.reset()
+    before = env.simulation.read()
+    with pytest.raises(BadInput, match="an action is 8 finite numbers"):
+        env.step(action)
+    same(env.simulation.read(), before)
+    s, reward, fallen, _, _ = env.step(np.zeros(8))
+    assert np.isfinite(s).all() and math.isfinite(reward) and not fallen
+
+
+@pytest.mark.parametrize(("number", "at"), [(np.nan, 0), (np.inf, 7), (-np.inf, 40)])
+def test_an_episode_ends_where_the_physics_is_lost(
+    env: Any, monkeypatch: pytest.MonkeyPatch, number: float, at: int
+) -> None:
+    start, _ = env.reset()
+    read, calls = env.simulation.read, []
+
+    def lost() -> np.ndarray:
+        calls.append(0)
+        row = np.array(read())
+        if len(calls) > 1:  # after the step, not before it
+            row[at] = number
+        return row
+
+    monkeypatch.setattr(env.simulation, "read", lost)
+    s, reward, over, cut, info = env.step(np.zeros(8))
+    assert over and not cut and reward == 0.0
+    np.testing.assert_array_equal(s, start)  # what was last seen of it
+    assert not np.isfinite(info["row"]).all()
+    monkeypatch.undo()
+    assert np.isfinite(env.reset()[0]).all()

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from genidm.engines.pool import MOST_ROWS, Pool, portions
+from genidm.engines.pool import MOST_ROWS, TRIES, Pool, portions
+from genidm.errors import BadInput
 
 STAND_IN = [sys.executable, str(Path(__file__).with_name("stand_in.py"))]
 
@@ -34,7 +35,7 @@ def rows(count: int) -> np.ndarray:
     return np.random.default_rng(count).uniform(0, 9, (count, 2)).astype(np.float32)
 
 
-def workers(pool: Pool) -> list[int]:
+def idle(pool: Pool) -> list[int]:
     """Process ids of the idle ones."""
     return pool.processes
 
@@ -54,13 +55,13 @@ def test_rows_are_given_out_in_ever_smaller_portions(count: int, workers: int) -
 
 def test_workers_are_started_once(make: Callable[..., Pool]) -> None:
     pool = make()
-    assert workers(pool) == []
+    assert idle(pool) == []
     assert pool.greeting() == [7]
     for _ in range(10):
         pool.map(rows(20))
-    first = set(workers(pool))
+    first = set(idle(pool))
     pool.map(rows(20))
-    assert set(workers(pool)) == first and len(first) <= 2
+    assert set(idle(pool)) == first and len(first) <= 2
 
 
 @pytest.mark.parametrize(("number", "patience"), [(13, 30.0), (14, 0.5)])
@@ -84,7 +85,7 @@ def test_a_worker_that_is_shot_takes_nothing_with_it(
 ) -> None:
     pool, x = make(patience=1.0), rows(40)
     pool.map(x)
-    for pid in workers(pool):
+    for pid in idle(pool):
         os.kill(pid, blow)
     with pytest.warns(RuntimeWarning, match="to be lost"):
         answers = pool.map(x)
@@ -92,11 +93,37 @@ def test_a_worker_that_is_shot_takes_nothing_with_it(
     assert 1 <= pool.replaced <= 2
 
 
-def test_a_worker_that_does_not_start_is_an_error(make: Callable[..., Pool]) -> None:
+def test_a_worker_that_never_starts_is_an_error(make: Callable[..., Pool]) -> None:
     pool = make("stillborn")
-    for _ in range(3):  # nobody waits for it, either
-        with pytest.raises(RuntimeError, match=r"does not start.*stand_in\.py stillborn"):
-            pool.map(rows(40))
+    said = rf"before it said anything, {TRIES} times: .*stand_in\.py stillborn"
+    for ask in (pool.greeting, lambda: pool.map(rows(40)), pool.greeting):
+        with pytest.raises(BadInput, match=said):  # nobody waits for it, either
+            ask()
+
+
+@pytest.mark.parametrize("deaths", [1, TRIES - 1])
+def test_a_worker_that_is_killed_before_it_has_said_anything_is_started_again(
+    make: Callable[..., Pool], tmp_path: Path, deaths: int
+) -> None:
+    pool, x = make(str(tmp_path / "starts"), str(deaths), workers=1), rows(40)
+    assert np.array_equal(pool.map(x), x.sum(1, keepdims=True))
+    assert pool.replaced == 0  # no row is to blame
+    assert len((tmp_path / "starts").read_text()) == deaths + 1
+
+
+def test_a_worker_that_dies_later_is_replaced_by_one_that_starts_late(
+    make: Callable[..., Pool], tmp_path: Path
+) -> None:
+    starts = tmp_path / "starts"
+    pool, x = make(str(starts), "0", workers=1), rows(5)
+    pool.map(x)
+    starts.write_text("")
+    pool.command = [*pool.command[:-1], "2"]
+    for pid in idle(pool):
+        os.kill(pid, signal.SIGKILL)
+    with pytest.warns(RuntimeWarning, match="another takes its place"):
+        assert np.array_equal(pool.map(x), x.sum(1, keepdims=True))
+    assert len(starts.read_text()) == 3
 
 
 def test_many_may_ask_at_once(make: Callable[..., Pool]) -> None:
@@ -111,7 +138,7 @@ def test_many_may_ask_at_once(make: Callable[..., Pool]) -> None:
 def test_closing_ends_the_workers(make: Callable[..., Pool]) -> None:
     pool = make()
     pool.map(rows(40))
-    (first, *_) = workers(pool)
+    (first, *_) = idle(pool)
     pool.close()
     with pytest.raises(ProcessLookupError):
         os.kill(first, 0)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+import shutil
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,7 +18,7 @@ from genidm.controller import PRETRAINED, load, pretrained
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Test, evaluate
 from genidm.evaluation.scenarios import scenarios
-from genidm.files import load_json
+from genidm.files import load_json, verify
 from genidm.robots import ROBOTS, Ant
 
 Change = Callable[[jax.Array], jax.Array]
@@ -85,3 +88,17 @@ def test_there_is_none_for_others() -> None:
     assert "ant" in NAMES and set(NAMES) <= set(ROBOTS)
     with pytest.raises(BadInput, match="no controller comes for 'cat'; there are some for: ant"):
         pretrained("cat")
+
+
+def test_a_clone_that_turns_line_ends_leaves_it_whole(tmp_path: Path) -> None:
+    """As git on Windows does: but for .gitattributes no file is as its manifest has it."""
+    root = Path(__file__).parents[1]
+    if not shutil.which("git") or not (root / ".git").exists():
+        pytest.skip("there is no git here, or this is no clone")
+    clone = ["git", "clone", "-q", "-c", "core.autocrlf=true", "--no-hardlinks", str(root), "there"]
+    subprocess.run(clone, cwd=tmp_path, check=True, capture_output=True)
+    there = tmp_path / "there"
+    assert b"\r\n" in (there / "pyproject.toml").read_bytes()  # line ends were turned
+    for name in NAMES:
+        assert verify(there / "genidm" / "pretrained" / name / "controller")
+        load(there / "genidm" / "pretrained" / name)

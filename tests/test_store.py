@@ -17,9 +17,9 @@ from bits import truncate
 from killing import Killed
 from test_config import Config, Other
 
-from genidm import store
+from genidm import files, store
 from genidm.config import digest, plain
-from genidm.files import load_json
+from genidm.files import Torn, load_json
 from genidm.provenance import environment
 from genidm.store import Stage
 
@@ -188,3 +188,20 @@ def test_without_locks_work_is_done_all_the_same(tmp_path: Path, monkeypatch) ->
     stage = Stage.open(tmp_path, "fit", {})
     stage.once(lambda: {"n": 1})
     assert stage.done
+
+
+def test_what_is_torn_in_a_stage_says_which_directory_to_delete(tmp_path: Path) -> None:
+    stage = Stage.open(tmp_path, "fit", {})
+    files.save_arrays(stage.path("controller"), {"a": np.ones(3)}, {})
+    assert stage.read(files.load_arrays, "controller", True)[1] == {}
+    (stage.path("controller") / "a.npy").write_bytes(b"")
+    for name in ("controller", "policy"):
+        with pytest.raises(Torn, match=rf"{name}.* Delete {stage.directory} to make it anew$"):
+            stage.read(files.load_arrays, name)
+
+    def said_already(path: Path) -> None:
+        raise Torn(f"{path} lacks a chunk. Delete {stage.directory} to make it anew")
+
+    with pytest.raises(Torn) as torn:
+        stage.read(said_already, "experience")
+    assert str(torn.value).count("Delete") == 1

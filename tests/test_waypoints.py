@@ -113,6 +113,60 @@ def test_any_planner_will_do() -> None:
     assert (there.arrival > 0).all() and there.position[..., 0].max() > 2.0
 
 
+@pytest.mark.parametrize(
+    ("planner", "answer"),
+    [
+        (lambda o, waypoints, left: straight(o, waypoints, left)[:, :2], r"float32\[\d, 2\]"),
+        (lambda o, waypoints, left: o[:, :1], r"float32\[\d, 1\]"),
+        (lambda o, waypoints, left: o[0], r"float32\[3\]"),
+        (lambda o, waypoints, left: o.sum(), r"float32\[\]"),
+        (lambda o, waypoints, left: left[:, :3], r"bool\[\d, 3\]"),
+        (lambda o, waypoints, left: waypoints, r"float32\[\d, 3, 3\]"),
+        (lambda o, waypoints, left: None, "None"),
+        (lambda o, waypoints, left: 1.0, r"1\.0"),
+        (lambda o, waypoints, left: [2.0, 0.0, 0.5], r"\[2\.0, 0\.0, 0\.5\]"),
+    ],
+)
+def test_a_planner_that_answers_something_else_is_refused(planner, answer: str) -> None:
+    said = rf"the planner must answer .* of shape \(\d, 3\), a row a robot, not {answer}"
+    with pytest.raises(BadInput, match=said):
+        journey(Point(), planner=planner)
+
+
+@pytest.mark.parametrize(
+    "planner",
+    [
+        lambda o, waypoints, left: np.asarray(waypoints)[:, 0],
+        lambda o, waypoints, left: waypoints[:, 0] if left.any() else o,
+        lambda o, waypoints, left: waypoints[:, int(left.sum())],
+        lambda o, waypoints, left: o + [float(x) for x in o[0]],
+    ],
+)
+def test_a_planner_that_looks_at_numbers_on_the_host_is_told_how_to(planner) -> None:
+    with pytest.raises(BadInput, match="the planner is asked inside a compiled program"):
+        journey(Point(), planner=planner)
+
+
+def test_a_planner_may_answer_with_numpys_constant() -> None:
+    """So long as it has a row a robot: of each device its own robots."""
+    ahead = journey(
+        Point(),
+        planner=lambda o, w, left: np.full(o.shape, 3.0),
+        mesh=devices.mesh(jax.devices()[:1]),
+    )
+    assert (ahead.arrival == -1).all()
+    np.testing.assert_allclose(ahead.position[:, -1, :2], 3.0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    "controller", [lambda s, way: s, lambda s, way: way[0], lambda s, way: None]
+)
+def test_a_controller_that_answers_something_else_is_refused(controller) -> None:
+    keys = jax.random.split(jax.random.key(0), 2)
+    with pytest.raises(BadInput, match=r"the controller must answer .* of shape \(1, 3\)"):
+        follow(Point(), controller, WAYPOINTS, keys, np.zeros(2), quiet=True)
+
+
 def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
     level = journey(Point(), waypoints=np.c_[WAYPOINTS, [0.5] * 3])
     np.testing.assert_array_equal(level.waypoints[..., 2], 0.5)
@@ -130,6 +184,8 @@ def test_a_robot_has_a_key_and_a_yaw() -> None:
     for yaw in (np.zeros(3), 0.0):
         with pytest.raises(BadInput, match=r"keys \[B\] and yaw \[B\]"):
             follow(Point(), lambda s, way: way, WAYPOINTS, keys, yaw)
+    with pytest.raises(BadInput, match="no robots to lead"):
+        follow(Point(), lambda s, way: way, WAYPOINTS, keys[:0], np.zeros(0))
 
 
 def test_each_robot_may_have_waypoints_of_its_own(made: Journeys) -> None:

@@ -18,6 +18,7 @@ from genidm.agents.policy import Activation, Policy
 from genidm.experience import Experience
 from genidm.progress import compiled
 from genidm.robots.base import Robot
+from genidm.rollout import narrow
 from genidm.tasks import Lanes, Task
 
 
@@ -112,6 +113,7 @@ class Alternates(abc.ABC):
     def policy(self, robot: Robot, task: Task, learner: Learner) -> Policy:
         """The policy of a learner, without exploration."""
         statistics, params = learner.training.chosen
+        statistics = narrow(statistics)
         return Policy(
             params=params, mean=statistics.mean, std=statistics.std, hidden=self.hidden,
             activation=self.activation, directed=task.directed, robot=robot,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from genidm import devices, trees
+from genidm import checks, devices, trees
 from genidm.agents.base import Agent, Learning
 from genidm.agents.buffer import Buffer
 from genidm.agents.remembering import Remembering
@@ -23,6 +22,8 @@ from genidm.tasks import Lanes, Task, WalkForward
 
 # Transitions that are written to disk at a time.
 CHUNK = 1 << 17
+# Transitions of an iteration: so many of the Ant's take 2 GB before anything is learned from them.
+MOST_AT_ONCE = 1 << 22
 
 
 def collect(
@@ -61,7 +62,7 @@ def collect(
       BadInput: what the learner has learned is not finite; nothing of that is kept.
     """
     mesh = mesh or devices.dividing(robot.mesh(), agent.lanes)
-    _check(agent, interactions, mesh)
+    _check(agent, interactions, seed, mesh)
     learning = agent.learning(robot, task or WalkForward(), mesh)
     learner = learning.place(jax.jit(learning.start)(jax.random.key(seed)))
     size = agent.lanes * agent.unroll
@@ -89,8 +90,10 @@ def whole(agent: Agent, interactions: int) -> int:
     return -(-interactions // size) * size
 
 
-def _check(agent: Agent, interactions: int, mesh: Mesh) -> None:
+def _check(agent: Agent, interactions: int, seed: int, mesh: Mesh) -> None:
     check_value("interactions", interactions, count())
+    check_value("seed", seed, checks.seed())
+    check_value("lanes × unroll", agent.lanes * agent.unroll, count(1, MOST_AT_ONCE))
     if agent.lanes % mesh.size:
         raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
 
@@ -139,7 +142,8 @@ class _Log:
             self.chunks.append(concatenate(self.parts))
             self.parts = []
             if self.stage:
-                self.chunks[-1].save(self._path(len(self.chunks) - 1), overwrite=True)
+                path = self.stage.path(self._name(len(self.chunks) - 1))
+                self.chunks[-1].save(path, overwrite=True)
         if self.checkpoints:
             self.checkpoints.save(iteration, {"learner": learner, "chunks": len(self.chunks)})
 
@@ -147,15 +151,16 @@ class _Log:
         """Iterations done, and the learner after them."""
         like = {"learner": learner, "chunks": 0}
         found = self.checkpoints and self.checkpoints.latest(like)
-        if not found:
+        if not self.stage or not found:
             return 0, learner
         iteration, tree = found
-        self.chunks = [load(self._path(i), self.robot) for i in range(tree["chunks"])]
+        names = map(self._name, range(tree["chunks"]))
+        self.chunks = [self.stage.read(load, name, self.robot) for name in names]
         return iteration, learning.place(tree["learner"])
 
-    def _path(self, chunk: int) -> Path:
-        assert self.stage
-        return self.stage.path("experience") / f"chunk_{chunk:05d}"
+    @staticmethod
+    def _name(chunk: int) -> str:
+        return f"experience/chunk_{chunk:05d}"
 
     def experience(self) -> Experience | None:
         return concatenate(self.chunks) if self.keep else None

@@ -114,9 +114,9 @@ class DDPG(OffPolicy):
         def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             which, noise, anywhere = jax.random.split(key, 3)
             size = (robot.action.size,)
-            explores = jax.random.uniform(which) < self.random
-            drawn = jax.random.uniform(anywhere, size, minval=-1.0)
-            return explores, self.noise * jax.random.normal(noise, size), drawn
+            explores = jax.random.uniform(which, (), jnp.float32) < self.random
+            drawn = jax.random.uniform(anywhere, size, jnp.float32, minval=-1.0)
+            return explores, self.noise * jax.random.normal(noise, size, jnp.float32), drawn
 
         def act(
             statistics: RunningStatisticsState, policy: Any, x: jax.Array, numbers: Any

@@ -44,7 +44,9 @@ class HER:
           height: metres; goals are given it, as all goals of the task have it.
         """
         which, when = jax.random.split(key)
-        relabelled = jax.random.uniform(which, at.row.shape) < self.goals / (self.goals + 1)
+        relabelled = jax.random.uniform(which, at.row.shape, jnp.float32) < self.goals / (
+            self.goals + 1
+        )
         first, last = self._window(buffer, left, at)
         offset = jax.random.randint(when, at.row.shape, first, last + 1)
         row = (at.row + offset) % buffer.rows.last.shape[0]

@@ -213,8 +213,9 @@ class OffPolicy(Alternates):
 
 
 def _check_room(buffer: Buffer) -> None:
-    size, room = sum(x.nbytes for x in jax.tree.leaves(buffer)), devices.memory()
-    if room is not None and 1.2 * size > room:
+    size = sum(x.nbytes for x in jax.tree.leaves(buffer))
+    room = devices.memory() or devices.host_memory()
+    if 1.2 * size > room:
         needs = f"the replay buffer needs {size / 1e9:.1f} GB, of {room / 1e9:.1f} on the device"
         raise BadInput(f"{needs}: give the agent a smaller capacity")
 

@@ -17,6 +17,7 @@ from brax.training.networks import MLP
 from flax import linen
 
 from genidm import files
+from genidm.checks import check_value, layers, one_of
 from genidm.robots.base import Robot
 from genidm.tasks import inputs
 
@@ -32,7 +33,7 @@ normalize = functools.partial(running_statistics.normalize, max_abs_value=10.0)
 
 def no_statistics(size: int) -> RunningStatisticsState:
     """Of no inputs yet; of strong types, as those from a checkpoint: one program serves both."""
-    state = running_statistics.init_state(jnp.zeros(size))
+    state = running_statistics.init_state(jnp.zeros(size, jnp.float32))
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
 
@@ -88,8 +89,12 @@ class Policy(flax.struct.PyTreeNode):
     def fresh(self, key: jax.Array) -> dict[str, Any]:
         """Parameters and statistics of the shapes that these have, untrained."""
         size = self.robot.observation.size + 3 * self.directed
-        params = self._network().init(key, jnp.zeros(size))
-        return {"params": params, "mean": jnp.zeros(size), "std": jnp.ones(size)}
+        params = self._network().init(key, jnp.zeros(size, jnp.float32))
+        return {
+            "params": params,
+            "mean": jnp.zeros(size, jnp.float32),
+            "std": jnp.ones(size, jnp.float32),
+        }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
         """Writes the policy as a directory, without pickle.
@@ -109,7 +114,16 @@ class Policy(flax.struct.PyTreeNode):
 
     @classmethod
     def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Policy:
-        """The policy that `save` wrote, from what lies in its directory."""
+        """The policy that `save` wrote, from what lies in its directory.
+
+        Raises:
+          BadInput: what it says of its network cannot be.
+        """
+        for name, allowed in (
+            ("hidden", layers), ("activation", one_of(ACTIVATIONS)),
+            ("directed", one_of((False, True))),
+        ):  # fmt: skip
+            check_value(name, meta[name], allowed)
         return cls(
             **tree,
             hidden=tuple(meta["hidden"]),

@@ -194,7 +194,7 @@ def _walk(
     distribution = networks.parametric_action_distribution
 
     def draw(key: jax.Array) -> jax.Array:
-        return jax.random.normal(key, (robot.action.size,))
+        return jax.random.normal(key, (robot.action.size,), jnp.float32)
 
     def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, Any]:
         logits = networks.policy_network.apply(statistics, policy, x)

@@ -7,6 +7,7 @@ import functools
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from genidm import devices
@@ -45,7 +46,7 @@ class RandomActions:
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         def draw(key: jax.Array) -> jax.Array:
-            return jax.random.uniform(key, (robot.action.size,), minval=-1.0)
+            return jax.random.uniform(key, (robot.action.size,), jnp.float32, minval=-1.0)
 
         def choose(_: jax.Array, drawn: jax.Array) -> tuple[jax.Array, None]:
             return drawn, None

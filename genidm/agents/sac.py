@@ -68,14 +68,14 @@ class SAC(OffPolicy):
             policy_key, critic_key = jax.random.split(key)
             policy = networks.policy_network.init(policy_key)
             critic = networks.q_network.init(critic_key)
-            log_alpha = jnp.zeros(())
+            log_alpha = jnp.zeros((), jnp.float32)
             # The target is a copy: one buffer cannot be donated twice.
             target = jax.tree.map(jnp.copy, critic)
             states = (adam.init(x) for x in (policy, critic, log_alpha))
             return Networks(policy, critic, target, log_alpha, *states)
 
         def draw(key: jax.Array) -> jax.Array:
-            return jax.random.normal(key, (robot.action.size,))
+            return jax.random.normal(key, (robot.action.size,), jnp.float32)
 
         def act(
             statistics: RunningStatisticsState, policy: Any, x: jax.Array, noise: jax.Array

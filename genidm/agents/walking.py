@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from genidm.agents.base import Metrics
 from genidm.experience import Experience, record
 from genidm.robots.base import Robot, select
-from genidm.rollout import Move, rollout
+from genidm.rollout import Move, narrow, rollout
 from genidm.tasks import Lanes, Step, Task, inputs
 
 # key → the random numbers of one action.
@@ -75,7 +75,7 @@ def walk(
         return _go_on(robot, task, carry, seen), kept
 
     carry, kept = rollout(robot, act, watch, carry, rows)
-    return (carry.lanes, *kept)
+    return (carry.lanes, *narrow(kept))
 
 
 def _go_on(robot: Robot, task: Task, carry: _Carry, seen: Step) -> _Carry:

@@ -45,7 +45,7 @@ class Bullet(Engine):
         return min(lanes, KEEP_BUSY * self.pool.workers)
 
     def step(self, physics: jax.Array, action: jax.Array) -> Stepped:
-        rows = jnp.concatenate([physics, action], axis=-1)
+        rows = jnp.concatenate([physics, action.astype(physics.dtype)], axis=-1)
         size = jax.ShapeDtypeStruct((len(rows), self.width), jnp.float32)
         after = jax.pure_callback(self._step_rows, size, rows.astype(jnp.float32))
         return Stepped(after.astype(rows.dtype), ())

@@ -47,7 +47,7 @@ class MJX(Engine):
             qpos=physics.qpos,
             qvel=physics.qvel,
             qacc_warmstart=physics.warmstart,
-            ctrl=jnp.clip(action, -1.0, 1.0),
+            ctrl=jnp.clip(action, -1.0, 1.0).astype(physics.qpos.dtype),
         )
         data = jax.lax.fori_loop(0, self._frame_skip, lambda _, d: mjx.step(self._model, d), data)
         wrenches = mjx.rne_postconstraint(self._model, data)._impl.cfrc_ext

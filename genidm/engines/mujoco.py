@@ -64,7 +64,7 @@ class MuJoCo(Engine):
 
     def step(self, physics: Physics, action: jax.Array) -> Stepped:
         m = self._model
-        action = jnp.clip(action, -1.0, 1.0)
+        action = jnp.clip(action, -1.0, 1.0).astype(physics.qpos.dtype)
         rows = jnp.concatenate([physics.qpos, physics.qvel, physics.warmstart, action], axis=-1)
         width = m.nq + 2 * m.nv + 6 * m.nbody
         size = jax.ShapeDtypeStruct((len(rows), width), rows.dtype)

@@ -21,11 +21,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from genidm.devices import cores
+from genidm.errors import BadInput
 
 # Rows given to a worker at once: so few that a worker that is lost takes few with it.
 MOST_ROWS = 16
 # Seconds that a worker may take to load its model.
 START_SECONDS = 120.0
+# Times that a worker is started until it says something; the machine may have been short of memory.
+TRIES = 3
 
 
 def portions(count: int, workers: int) -> list[int]:
@@ -52,6 +55,9 @@ class Worker:
     Args:
       command: the program and its arguments.
       size: numbers in an answered row.
+
+    Raises:
+      Lost: it died, or said nothing.
     """
 
     def __init__(self, command: Sequence[str], size: int):
@@ -64,7 +70,11 @@ class Worker:
         assert self.process.stdin and self.process.stdout
         self._sink, self._source = self.process.stdin.fileno(), self.process.stdout.fileno()
         self._size = size
-        self.greeting = self._receive(1, START_SECONDS)[0]
+        try:
+            self.greeting = self._receive(1, START_SECONDS)[0]
+        except BaseException:
+            self.kill()
+            raise
 
     def exchange(self, rows: np.ndarray, patience: float) -> np.ndarray:
         """Answers `[n, out]` to `rows [n, in]`.
@@ -136,7 +146,11 @@ class Pool:
         return [worker.process.pid for worker in list(self._idle.queue) if worker]
 
     def greeting(self) -> np.ndarray:
-        """What workers say first, `[out]`."""
+        """What workers say first, `[out]`.
+
+        Raises:
+          BadInput: none starts.
+        """
         worker = self._idle.get()
         try:
             worker = worker or self._start()
@@ -148,6 +162,9 @@ class Pool:
         """Answers `[n, out]` to `rows [n, in]`, in their order.
 
         A row that costs a worker its life is answered by NaN; the others are not touched.
+
+        Raises:
+          BadInput: no worker starts any more.
         """
         parts = np.split(rows, np.cumsum(portions(len(rows), self.workers))[:-1])
         return np.concatenate([*self._threads.map(self._answer, parts)])
@@ -179,11 +196,13 @@ class Pool:
             self._idle.put(worker)
 
     def _start(self) -> Worker:
-        try:
-            return Worker(self.command, self.size)
-        except Lost:
-            # Not to be mended by another worker.
-            raise RuntimeError(f"a worker does not start: {' '.join(self.command)}") from None
+        for _ in range(TRIES):
+            with contextlib.suppress(Lost, OSError):
+                return Worker(self.command, self.size)
+        raise BadInput(
+            f"a worker process ended before it said anything, {TRIES} times: "
+            f"{' '.join(self.command)}"
+        )
 
     def _count(self, rows: int) -> None:
         with self._counting:

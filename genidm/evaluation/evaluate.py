@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from genidm import devices
+from genidm import checks, devices
+from genidm.checks import check_value, count
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.evaluator import Evaluator, Outcome, Steering, Test, Watch, position
-from genidm.evaluation.scenarios import Scenarios
+from genidm.evaluation.scenarios import MOST_EPISODES, Scenarios
 from genidm.progress import Progress
 from genidm.robots.base import Robot
 from genidm.store import Stage
@@ -62,11 +63,18 @@ def walking_speed(robot: Robot, policy: Steering, episodes: int = 100, seed: int
     """Speed towards +x of a policy that learned to walk there, `[episodes]`, m/s.
 
     Each episode starts as in training and ends with a fall, or after 1000 steps.
+
+    Raises:
+      BadInput: there is no episode, or too many; or the seed has no 32 bits.
     """
+    check_value("episodes", episodes, count(1, MOST_EPISODES))
+    check_value("seed", seed, checks.seed())
     keys = jax.random.split(jax.random.key(seed), (1, episodes))
     # A target that is out of reach: what is gained on it is the way walked.
-    target = jnp.broadcast_to(jnp.asarray([1e4, 0.0, 0.0]), (1, episodes, 3))
-    outcome = evaluate(robot, policy, Scenarios(keys, jnp.zeros((1, episodes)), target))
+    target = jnp.broadcast_to(jnp.asarray([1e4, 0.0, 0.0], jnp.float32), (1, episodes, 3))
+    outcome = evaluate(
+        robot, policy, Scenarios(keys, jnp.zeros((1, episodes), jnp.float32), target)
+    )
     return (outcome.start - outcome.closest)[0] / (outcome.steps[0] * robot.control_step)
 
 

@@ -19,17 +19,78 @@ from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.checks import check, count, number
+from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
 from genidm.progress import compiled
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
 from genidm.symmetry import horizontal
 
+# Steps of an episode, which a trace holds, and of a program call, which holds what each leaves.
+MOST_STEPS = 10**5
+MOST_AT_ONCE = 10**4
+
 # (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled
 # program serves every controller of the same shape.
 Steering = Callable[[jax.Array, jax.Array], jax.Array]
 # State [B] → a tree of arrays [B, ...]: what is kept of each state of a traced episode.
 Watch = Callable[[State], Any]
+
+
+# What jax raises where a function of the user's looks at numbers that are not there yet.
+_NOT_TRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def ask(who: str, asked: Callable[..., Any], shape: tuple[int, ...], *args: Any) -> jax.Array:
+    """What a function of the user's answers inside a program, if it is an array of this shape.
+
+    Args:
+      who: what an error calls it.
+      asked: the function.
+      shape: that its answer must have; one that would only be broadcast is refused, too.
+      args: what it is asked with.
+
+    Raises:
+      BadInput: the answer is something else, or cannot be computed inside a program.
+    """
+    try:
+        answer = asked(*args)
+    except _NOT_TRACEABLE:
+        raise BadInput(
+            f"{who} is asked inside a compiled program: it must compute with jax.numpy, and "
+            "choose with jnp.where"
+        ) from None
+    wanted = f"{who} must answer an array of numbers of shape {shape}, a row a robot"
+    if not isinstance(answer, jax.Array | np.ndarray):
+        raise BadInput(f"{wanted}, not {answer!r:.40}")
+    if answer.shape != shape or not (
+        jnp.issubdtype(answer.dtype, jnp.floating) or jnp.issubdtype(answer.dtype, jnp.integer)
+    ):
+        raise BadInput(f"{wanted}, not {answer.dtype}{list(answer.shape)}")
+    return jnp.asarray(answer)
+
+
+def as_tree(controller: Steering) -> Any:
+    """A controller as a program takes it: a tree of arrays as it is, other functions as constants.
+
+    One compiled program serves every controller that is a tree, of the same shape.
+    """
+    alone = jax.tree.leaves(controller) == [controller]
+    return jax.tree_util.Partial(controller) if alone else controller
+
+
+def steered(robot: Robot, controller: Steering, robots: State, target: jax.Array) -> jax.Array:
+    """Actions `[B, A]` for robots `[B]` on their way to `target [B, 3]`, metres.
+
+    Raises:
+      BadInput: the controller answers something else.
+    """
+    s, way = robots.observation, target - robots.position
+    return ask("the controller", controller, (len(s), robot.action.size), s, way).astype(s.dtype)
 
 
 def position(state: State) -> jax.Array:
@@ -56,7 +117,8 @@ class Test:
     chunk: int = 50
 
     def __post_init__(self) -> None:
-        check(self, max_steps=count(), lanes=count(), chunk=count(), reach=number(0))
+        steps, chunk = count(1, MOST_STEPS), count(1, MOST_AT_ONCE)
+        check(self, max_steps=steps, lanes=count(), chunk=chunk, reach=number(0))
 
 
 class Outcome(flax.struct.PyTreeNode):
@@ -155,7 +217,7 @@ class Evaluator:
             robots=jax.tree.map(
                 lambda x: jnp.zeros((lanes, *x.shape[1:]), x.dtype), self._shares.robots
             ),
-            target=jnp.zeros((lanes, 3)),
+            target=jnp.zeros((lanes, 3), jnp.float32),
             episode=jnp.full(lanes, share, jnp.int32),
             now=_nothing(lanes),
             taken=jnp.zeros(count, jnp.int32),
@@ -178,7 +240,7 @@ class Evaluator:
 
     def prepare(self, controller: Steering, queue: Queue) -> Callable[[Queue], Queue]:
         """The compiled program of `settings.chunk` steps of every lane; it donates the queue."""
-        controller = devices.put(controller, self.mesh, None)
+        controller = devices.put(as_tree(controller), self.mesh, None)
         shares = self._shares
         body = functools.partial(_chunk, self.robot, self.settings, self.watch)
         sharded = devices.over_lanes(body, self.mesh, [None, 0, 0], 0)
@@ -231,7 +293,7 @@ class Evaluator:
 
 
 def _nothing(count: int) -> Outcome:
-    def zeros(kind: type = float) -> jax.Array:
+    def zeros(kind: Any = jnp.float32) -> jax.Array:
         return jnp.zeros(count, kind)  # an array of its own, as it is donated
 
     return Outcome(
@@ -267,8 +329,7 @@ def _chunk(
 
     def act(lanes: Running, _: None) -> tuple[State, jax.Array, Running]:
         lanes = _take(lanes, shares)
-        o = lanes.robots.position
-        return lanes.robots, controller(lanes.robots.observation, lanes.target - o), lanes
+        return lanes.robots, steered(robot, controller, lanes.robots, lanes.target), lanes
 
     def watch(_: Running, move: Move) -> tuple[Running, _Seen]:
         lanes: Running = move.notes
@@ -287,25 +348,25 @@ def _take(lanes: Running, shares: Share) -> Running:
     """Idle lanes take the next episodes of the queue, while there are any."""
     total = len(shares.target)
     idle = lanes.episode >= total
-    rank = lanes.taken + jnp.cumsum(idle) - 1
+    rank = lanes.taken + jnp.cumsum(idle, dtype=jnp.int32) - 1
     takes = idle & (rank < total)
     episode = jnp.where(takes, rank, lanes.episode).astype(jnp.int32)
     new = jax.tree.map(lambda x: x[jnp.minimum(episode, total - 1)], shares)
-    distance = horizontal(new.target - new.robots.position)
+    distance = horizontal(new.target - new.robots.position).astype(jnp.float32)
     fresh = _nothing(episode.shape[0]).replace(closest=distance, start=distance)
     return Running(
         robots=select(takes, new.robots, lanes.robots),
         target=select(takes, new.target, lanes.target),
         episode=episode,
         now=select(takes, fresh, lanes.now),
-        taken=lanes.taken + takes.sum(),
+        taken=lanes.taken + takes.sum(dtype=jnp.int32),
     )
 
 
 def _observe(now: Outcome, move: Move, target: jax.Array, reach: float) -> Outcome:
     """The outcomes so far, with one more step in them."""
     o, o_next = move.before.position, move.after.position
-    distance = horizontal(target - o_next)
+    distance = horizontal(target - o_next).astype(jnp.float32)
     return Outcome(
         closest=jnp.minimum(now.closest, distance),
         start=now.start,
@@ -313,7 +374,7 @@ def _observe(now: Outcome, move: Move, target: jax.Array, reach: float) -> Outco
         fell=move.after.fallen,
         diverged=move.after.diverged,
         steps=now.steps + 1,
-        path_length=now.path_length + horizontal(o_next - o),
+        path_length=now.path_length + horizontal(o_next - o).astype(jnp.float32),
     )
 
 

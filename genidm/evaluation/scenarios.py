@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from genidm.checks import check_value, count
+from genidm.checks import check_value, count, seed
 from genidm.robots.base import Robot
 from genidm.tasks import ahead
 
@@ -43,6 +43,8 @@ class Scenarios(flax.struct.PyTreeNode):
 
 # So that the scenarios of seed n are not the random numbers of a collecting seed n.
 BANK = 0x7E57
+# Their starts lie in memory at once: a hundred times the paper's take a gigabyte for the Ant.
+MOST_EPISODES = 10**6
 
 
 def scenarios(
@@ -58,23 +60,29 @@ def scenarios(
       seeds: number of test seeds.
       episodes: episodes a seed.
       first_seed: the first of them.
+
+    Raises:
+      BadInput: there are none, or more than `MOST_EPISODES` in all, or a seed has no 32 bits.
     """
     check_value("seeds of a test", seeds, count())
     check_value("episodes of a test", episodes, count())
-    numbers = jnp.arange(first_seed, first_seed + seeds)
-    return _bank(robot, numbers, jnp.arange(episodes))
+    check_value("seeds × episodes of a test", seeds * episodes, count(1, MOST_EPISODES))
+    check_value("first seed of a test", first_seed, seed())
+    check_value("last seed of a test", first_seed + seeds - 1, seed())
+    numbers = np.arange(first_seed, first_seed + seeds).astype(np.uint32)
+    return _bank(robot, numbers, np.arange(episodes, dtype=np.uint32))
 
 
-def _bank(robot: Robot, seeds: jax.Array, episodes: jax.Array) -> Scenarios:
+def _bank(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenarios:
     def one(seed: jax.Array, episode: jax.Array) -> tuple[jax.Array, ...]:
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(BANK), seed), episode)
         start, turn, far, side = jax.random.split(key, 4)
         low, high = robot.target_distance
         return (
             start,
-            jax.random.uniform(turn, minval=-jnp.pi, maxval=jnp.pi),
-            jax.random.uniform(far, minval=low, maxval=high),
-            jax.random.uniform(side, minval=-jnp.pi / 4, maxval=jnp.pi / 4),
+            jax.random.uniform(turn, (), jnp.float32, minval=-jnp.pi, maxval=jnp.pi),
+            jax.random.uniform(far, (), jnp.float32, minval=low, maxval=high),
+            jax.random.uniform(side, (), jnp.float32, minval=-jnp.pi / 4, maxval=jnp.pi / 4),
         )
 
     grid = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
@@ -96,7 +104,7 @@ def toward(
     """
     flat = [x.reshape(-1) for x in (keys, yaw, distance, bearing)]
     target = ahead(robot, jax.jit(robot.reset)(*flat[:2]), *flat[2:])
-    return Scenarios(keys, yaw, target.reshape(*yaw.shape, 3))
+    return Scenarios(keys, yaw, target.reshape(*yaw.shape, 3).astype(jnp.float32))
 
 
 # Fig. 8: ten episodes where the robot starts as it did while it learned, and ten where it
@@ -111,13 +119,13 @@ def tours(robot: Robot) -> Scenarios:
     Row 0 starts at yaw 0, as all experience did; row 1 turned by 135°.
     """
     low, high = robot.target_distance
-    far = jnp.linspace((low + high) / 2, high, TOUR)
-    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, TOUR)
+    far = jnp.linspace((low + high) / 2, high, TOUR, dtype=jnp.float32)
+    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, TOUR, dtype=jnp.float32)
     shape = (2, TOUR)
     return toward(
         robot,
         keys=jnp.broadcast_to(jax.random.key(BANK), shape),
-        yaw=jnp.broadcast_to(jnp.asarray([[0.0], [UNSEEN_YAW]]), shape),
+        yaw=jnp.broadcast_to(jnp.asarray([[0.0], [UNSEEN_YAW]], jnp.float32), shape),
         distance=jnp.broadcast_to(far, shape),
         bearing=jnp.broadcast_to(side, shape),
     )

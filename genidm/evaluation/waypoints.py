@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from genidm import devices
 from genidm.checks import check, count, positive
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Steering
+from genidm.evaluation.evaluator import MOST_AT_ONCE, Steering, as_tree, ask, steered
 from genidm.progress import Progress, compiled
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
@@ -57,7 +57,8 @@ class Follow:
     chunk: int = 50
 
     def __post_init__(self) -> None:
-        check(self, max_steps=count(), chunk=count(), reach=positive())
+        steps, chunk = count(1, 10**6), count(1, MOST_AT_ONCE)
+        check(self, max_steps=steps, chunk=chunk, reach=positive())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,14 +189,17 @@ def follow(
       quiet: no progress bar.
 
     Raises:
-      BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key.
+      BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key; no
+        robots; planner or controller answer something else than they should.
     """
     settings, mesh = settings or Follow(), mesh or robot.mesh()
     if jnp.ndim(keys) != 1 or jnp.shape(yaw) != keys.shape:
-        raise BadInput(f"keys [B] and yaw [B] are of {keys.shape} and {jnp.shape(yaw)}")
+        raise BadInput(f"keys [B] and yaw [B] are of {jnp.shape(keys)} and {jnp.shape(yaw)}")
+    if not len(keys):
+        raise BadInput("there are no robots to lead: keys [B] is empty")
     points = _checked(waypoints, len(keys), robot.standing_height)
     walker = _start(robot, points, keys, yaw, mesh)
-    controller = devices.put(controller, mesh, None)
+    controller = devices.put(as_tree(controller), mesh, None)
     look = functools.partial(_seen, watch)
     body = functools.partial(_chunk, robot, planner, settings, look)
     sharded = devices.over_lanes(body, mesh, [None, 0], (0, 1))
@@ -296,8 +300,10 @@ def _chunk(
 
     def act(walker: Walker, _: None) -> tuple[State, jax.Array, None]:
         robots = walker.robots
-        target = planner(robots.position, points, walker.arrival < 0)
-        return robots, controller(robots.observation, target - robots.position), None
+        o = robots.position
+        target = ask("the planner", planner, o.shape, o, points, walker.arrival < 0)
+        target = target.astype(o.dtype)
+        return robots, steered(robot, controller, robots, target), None
 
     def watch(walker: Walker, move: Move) -> tuple[Walker, Any]:
         after, steps, left = move.after, walker.steps + 1, walker.arrival < 0

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from genidm import devices, trees
-from genidm.checks import check, count, layers, number, optional, positive
+from genidm.checks import WIDEST, check, count, layers, number, optional, positive
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
 from genidm.paper import protocol
@@ -23,6 +23,8 @@ from genidm.robots.base import Robot
 from genidm.store import Stage
 
 STD_FLOOR = 1e-2
+# A minibatch of the Ant, in two views through two layers of 256, then takes 3 GB.
+MOST_IN_BATCH = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +60,9 @@ class Fit:
     def __post_init__(self) -> None:
         check(
             self, {"latent_weight": "λ (latent_weight)", "latent_size": "k (latent_size)"},
-            updates=count(), batch=count(), learning_rate=positive(), idm=layers, lfm=layers,
-            latent_size=optional(count(1, 1 << 16)),
+            updates=count(), batch=count(1, MOST_IN_BATCH), learning_rate=positive(),
+            idm=layers, lfm=layers,
+            latent_size=optional(count(1, WIDEST)),
             latent_weight=number(0, 1, above=True, below=True),
         )  # fmt: skip
 

@@ -49,7 +49,7 @@ class Generalize:
     lanes: int = 512
 
     def __post_init__(self) -> None:
-        check(self, segment=optional(count()), copies=count(), lanes=count())
+        check(self, segment=optional(count()), copies=count(1, 1000), lanes=count())
 
     def on(self, robot: Robot) -> Generalize:
         """The settings with a segment's length chosen for the robot, unless it is given."""
@@ -105,7 +105,7 @@ def rotate(robot: Robot, experience: Experience, key: jax.Array, copies: int = 1
     """The record turned exactly, each sample by a yaw of its own, without physics."""
     experience = experience.prepared(robot)
     shape = (copies, *experience.first.shape)
-    yaw = jax.random.uniform(key, shape, minval=-jnp.pi, maxval=jnp.pi)
+    yaw = jax.random.uniform(key, shape, jnp.float32, minval=-jnp.pi, maxval=jnp.pi)
     turn = jax.vmap(symmetry.turn_vector, (None, 0))
     return Replay(
         s=jax.vmap(robot.observation.turn, (None, 0))(jnp.asarray(experience.s), yaw),

@@ -58,12 +58,12 @@ class Architecture:
     def init(self, key: jax.Array, state_size: int) -> dict[str, object]:
         """Fresh parameters {"idm": …} and, with a latent, {"lfm": …}."""
         psi, phi = jax.random.split(key)
-        x = jnp.zeros(state_size + 3)
+        x = jnp.zeros(state_size + 3, jnp.float32)
         if self.latent_size is None:
             return {"idm": self._idm().init(phi, x)}
         return {
             "lfm": self._lfm().init(psi, x),
-            "idm": self._idm().init(phi, jnp.zeros(self.latent_size)),
+            "idm": self._idm().init(phi, jnp.zeros(self.latent_size, jnp.float32)),
         }
 
     def _idm(self) -> MLP:

@@ -15,7 +15,7 @@ from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
-from genidm.checks import check, count, positive
+from genidm.checks import check, check_value, count, label, positive
 from genidm.controller import Frame
 from genidm.errors import BadInput
 from genidm.paper import protocol
@@ -39,9 +39,7 @@ class Method:
     task: WalkForward | GoToGoal
 
     def __post_init__(self) -> None:
-        name = self.name
-        if not name.strip() or "/" in name or name.startswith(".") or not name.isprintable():
-            raise BadInput(f"a method's name begins directories: not {name!r:.60}")
+        check_value("a method's name", self.name, label)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import symmetry
+from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
 from genidm.paper.replaying import Replay
@@ -59,15 +60,16 @@ def pairs(
       mirror: adds the reflection y → −y of every sample, in every view.
 
     Raises:
-      BadInput: look_ahead is below 1 or longer than all episodes, or the record is unusable.
+      BadInput: look_ahead is no whole number from 1 on, or longer than all episodes, or the record
+        is unusable.
     """
-    if look_ahead < 1:
-        raise BadInput(f"look_ahead must be at least 1, not {look_ahead}")
+    check_value("look_ahead", look_ahead, count())
     experience = experience.prepared(robot)
     goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.ends), look_ahead))
     ahead = np.take_along_axis(experience.o_next, goal[..., None], axis=0)
     views = [(experience.s, ahead - experience.o)]
     # A step that is not valid is no goal for others, either.
+    _tell_of_gaps(experience)
     valid = experience.valid & exists & np.take_along_axis(experience.valid, goal, axis=0)
     for copy in _copies(turned):
         views.append((copy.s, _goal(copy, goal, ahead) - copy.o))
@@ -82,6 +84,15 @@ def pairs(
         )
     out = _samples(views, experience.a, valid)
     return with_reflection(robot, out) if mirror else out
+
+
+def _tell_of_gaps(experience: Experience) -> None:
+    """Says how much of somebody's log is marked as not valid; a simulation counts its own."""
+    if experience.physics is None and not experience.valid.all():
+        gone = ~experience.valid
+        t, lane = np.argwhere(gone)[0]
+        said = f"{gone.sum()} of {gone.size} steps are not valid and left out, first [{t}, {lane}]"
+        warnings.warn(said, stacklevel=3)
 
 
 def _copies(turned: Replay | None) -> Iterator[Replay]:

@@ -83,6 +83,7 @@ class Blocks:
     ):
         first = np.asarray(experience.first)
         self.steps, recorded = first.shape
+        length = min(length, self.steps)
         self.length, self.follow = length, follow
         time = np.arange(self.steps, dtype=np.int32)[:, None]
         self.placed = first | (time % (self.steps if follow else length) == 0)
@@ -170,7 +171,7 @@ class Runner:
 
     def start(self, keys: jax.Array, block: Block) -> Cursor:
         """A cursor for a block, with keys `[lanes]`; its robots are placed before they step."""
-        yaw = jnp.zeros(keys.shape)
+        yaw = jnp.zeros(keys.shape, jnp.float32)
         first = jax.tree.map(lambda x: x[0], block["physics"])
         shapes = jax.eval_shape(self.robot.place, first, yaw)
         robots = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -215,6 +216,6 @@ class Runner:
 def _draw_yaw(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     streams = jax.vmap(jax.random.split)(keys)
     draw: Callable[[jax.Array], jax.Array] = jax.vmap(
-        lambda k: jax.random.uniform(k, minval=-jnp.pi, maxval=jnp.pi)
+        lambda k: jax.random.uniform(k, (), jnp.float32, minval=-jnp.pi, maxval=jnp.pi)
     )
     return streams[:, 0], draw(streams[:, 1])

@@ -48,7 +48,7 @@ def by_name(name: str, engine: str | None = None) -> Robot:
       BadInput: there is none of that name, or that engine does not step it.
     """
     if name not in ROBOTS:
-        raise BadInput(f"no robot is called {name!r}; there are: {', '.join(ROBOTS)}")
+        raise BadInput(f"no robot is called {name!r:.80}; there are: {', '.join(ROBOTS)}")
     kind: Any = ROBOTS[name]
     if engine is not None and not kind.engines:
         raise BadInput(f"the {name} steps itself: it takes no engine {engine!r}")

@@ -18,6 +18,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from genidm import devices
+from genidm.checks import check_value, label
 from genidm.engines.base import Engine
 from genidm.errors import BadInput
 from genidm.symmetry import Layout
@@ -78,6 +79,11 @@ class Robot(abc.ABC):
     observation: Layout
     physics: Any
     action: Layout
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        if "name" in vars(cls):
+            check_value("the name of a robot", cls.name, label)
 
     @abc.abstractmethod
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:

@@ -105,9 +105,10 @@ class Humanoid(MujocoRobot):
     def _draw(self, key: jax.Array) -> Physics:
         """PyBullet's start: upright and at rest, with uniform noise in the joints."""
         noise, count = self.reset_noise, len(self.mirror.hinges)
-        angles = jax.random.uniform(key, (count,), minval=-noise, maxval=noise)
+        angles = jax.random.uniform(key, (count,), jnp.float32, -noise, noise)
         qpos = jnp.asarray(self._rest).at[7:].add(angles)
-        return Physics(qpos, jnp.zeros(count + 6), jnp.zeros(count + 6))
+        still = jnp.zeros(count + 6, jnp.float32)
+        return Physics(qpos, still, still)
 
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         angles = symmetry.euler_of(physics.qpos[3:7])

@@ -189,7 +189,7 @@ class Minitaur(Robot):
         """The settled start of pybullet_envs, the base given a slight push."""
         with jax.ensure_compile_time_eval():
             rest = self._rest
-        push = jax.vmap(lambda key: jax.random.normal(key, (6,)))(keys)
+        push = jax.vmap(lambda key: jax.random.normal(key, (6,), jnp.float32))(keys)
         still = jnp.broadcast_to(rest.motion, (*keys.shape, MOTION.size))
         moving = still.at[:, :6].add(self.reset_noise * push)
         alike = jax.tree.map(lambda x: jnp.broadcast_to(x, (*keys.shape, *x.shape)), rest)

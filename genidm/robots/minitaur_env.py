@@ -54,9 +54,13 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observe(parts(self.simulation.read())), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        action, last = np.asarray(action, np.float64), self.simulation.read()
+        given, last = action, self.simulation.read()
+        try:
+            action = np.asarray(given, np.float64)
+        except (TypeError, ValueError):
+            action = np.full(0, np.nan)
         if action.shape != (ACTIONS,) or not np.isfinite(action).all():
-            raise BadInput(f"an action is {ACTIONS} finite numbers, not {action}")
+            raise BadInput(f"an action is {ACTIONS} finite numbers, not {given!r:.80}")
         before = last[0]
         self.simulation.step(action)
         row = self.simulation.read()

@@ -200,15 +200,15 @@ class MujocoRobot(Robot):
         pose, motion = jax.random.split(key)
         noise, nq, nv = self.reset_noise, self.mj_model.nq, self.mj_model.nv
         qpos = jnp.asarray(self._rest) + jax.random.uniform(
-            pose, (nq,), minval=-noise, maxval=noise
+            pose, (nq,), jnp.float32, minval=-noise, maxval=noise
         )
         # MuJoCo reads a quaternion of any length; the observation needs a unit one.
         qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
-        qvel = noise * jax.random.normal(motion, (nv,))
-        return Physics(qpos, qvel, jnp.zeros(nv))
+        qvel = noise * jax.random.normal(motion, (nv,), jnp.float32)
+        return Physics(qpos, qvel, jnp.zeros(nv, jnp.float32))
 
     def place(self, physics: Physics, yaw: jax.Array) -> State:
-        contact = jnp.zeros((*yaw.shape, self.mj_model.nbody, 6))
+        contact = jnp.zeros((*yaw.shape, self.mj_model.nbody, 6), physics.qpos.dtype)
         state = jax.vmap(self._state)(self.turn_physics(physics, yaw), contact)
         # A start is not judged: noise may lift a robot out of its healthy height.
         return state.replace(fallen=jnp.zeros_like(state.fallen))

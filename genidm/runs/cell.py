@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from genidm import controller, devices
+from genidm import controller, devices, files
+from genidm.checks import shown
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Steering
 from genidm.evaluation.scenarios import Scenarios, scenarios
@@ -31,6 +32,9 @@ def cell_of(
     """The cell of a method exactly as it is given; `notes` say who set what."""
     if options.video:
         robot.drawing()  # what cannot be filmed is said before anything is computed
+    for directory in (options.out, options.results):
+        if directory is not None:
+            files.check_writable(directory, directory=True)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale_of(options.scale, robot.paper_interactions), seed=options.seed,
         root=options.out / robot.name, test=options.test,
@@ -81,10 +85,13 @@ def saved(
     robots: dict[str, Robot] = {}
     models: dict[str, tuple[Steering, dict[str, Any]]] = {}
     for run in runs:
-        summary = Stage(run).summary()
-        kind, name = summary["robot"], summary["method"]
+        stage = Stage(run)
+        summary = stage.summary()
+        if not isinstance(summary, dict) or not {"robot", "method"} <= summary.keys():
+            raise BadInput(f"{run} is no run of a controller: METHOD-SEED-… under --out of a cell")
+        kind, name = str(summary["robot"]), shown(summary["method"])
         robots.setdefault(kind, by_name(kind, engine))
-        model = controller.load(run, robots[kind])
+        model = stage.read(controller.load, ".", robots[kind])
         models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
     if len(robots) > 1:
         raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")

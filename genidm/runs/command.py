@@ -10,11 +10,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
+import jax
 import tyro
 
 from genidm import devices
 from genidm.checkpoints import requested_seconds
-from genidm.errors import BadInput
+from genidm.errors import BadInput, sentence
 from genidm.paper.methods import Direct, Inverse
 from genidm.robots import Robot
 from genidm.runs.cell import cell_of, run_to_the_end
@@ -84,9 +85,17 @@ def in_sentences() -> Iterator[None]:
     try:
         devices.requested()
         requested_seconds()
-        yield
+        try:
+            yield
+        finally:
+            sys.stdout.flush()  # `… | head` may have ended: here that is caught, at the exit not
     except BadInput as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except jax.errors.JaxRuntimeError as error:
+        if (said := sentence(error)) is None:
+            raise
+        print(f"error: {said}", file=sys.stderr)
         sys.exit(2)
     except MemoryError as error:
         print(f"error: not enough memory: {error}", file=sys.stderr)

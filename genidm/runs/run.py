@@ -26,6 +26,7 @@ from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.policy import Policy
 from genidm.config import plain
 from genidm.errors import BadInput
+from genidm.evaluation import sanity
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.evaluate import Steering, Test, episodes, flatten, run
 from genidm.evaluation.scenarios import Scenarios, tours
@@ -164,9 +165,12 @@ class Cell(abc.ABC, Generic[M]):
         rest = jax.tree.map(lambda x: np.asarray(x)[shown:], outcome)
         ways = [trace.way for trace in traces[:shown]]
         recordings = self._recordings(traces[shown:], bank.target[0])
-        save_test(stage, episodes(rest, bank.shape), ways, recordings)
+        outcomes = episodes(rest, bank.shape)
+        save_test(stage, outcomes, ways, recordings)
         return (
             self.controller_stage.summary()
+            | sanity.walked(self.method.name, outcomes)
+            | sanity.heeds(self.method.name, ways, np.asarray(walks.target))
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
             | {"engine": self.robot.engine_name}
             | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
@@ -209,7 +213,7 @@ class InverseCell(Cell[Inverse]):
         if made:
             return made[0]
         recorded = stage.summary()["recorded"]
-        return experience.load_chunks(stage.path("experience"), self.robot, recorded)
+        return stage.read(experience.load_chunks, "experience", self.robot, recorded)
 
     def _collected(self, made: list[Experience]) -> dict[str, Any]:
         """Collects; what it has in memory then goes into `made`."""
@@ -249,7 +253,7 @@ class InverseCell(Cell[Inverse]):
             return {"interactions": interactions}
 
         stage.once(work)
-        learned = controller.load(stage.path("policy"), self.robot)
+        learned = stage.read(controller.load, "policy", self.robot)
         assert isinstance(learned, Policy)
         return Acting(frozen.agent, learned), interactions
 
@@ -277,7 +281,7 @@ class InverseCell(Cell[Inverse]):
             return {"replayed": turned.yaw.size}
 
         stage.once(work)
-        return Replay.load(stage.path("replay"))
+        return stage.read(Replay.load, "replay")
 
     @functools.cached_property
     def controller_stage(self) -> Stage:
@@ -305,7 +309,7 @@ class InverseCell(Cell[Inverse]):
         """The fitted models."""
         stage = self.controller_stage
         stage.once(self._fitted)
-        return controller.load(stage.path("controller"), self.robot)
+        return stage.read(controller.load, "controller", self.robot)
 
     def _fitted(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
@@ -346,7 +350,7 @@ class DirectCell(Cell[Direct]):
         """The policy that the agent ended with."""
         stage = self.controller_stage
         stage.once(self._learned)
-        return controller.load(stage.path("controller"), self.robot)
+        return stage.read(controller.load, "controller", self.robot)
 
     def _learned(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method

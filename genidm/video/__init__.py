@@ -13,7 +13,7 @@ from typing import Any
 
 from genidm.checks import check_value, number
 from genidm.errors import BadInput
-from genidm.files import save_bytes, save_text, writable
+from genidm.files import check_writable, save_bytes, save_text
 from genidm.video.backends import backend
 from genidm.video.clip import FASTEST, encoder, gif, mp4
 from genidm.video.filming import Film, Take, film, film_run, film_test, film_tested, recorded
@@ -39,7 +39,7 @@ def check(path: Path | str, **changes: Any) -> Shot:
     if kind not in SHOTS:
         raise BadInput(f"a film is a .gif, an .mp4 or a page (.html), not {Path(path).name}")
     shot = dataclasses.replace(SHOTS[kind], **changes)
-    writable(path)
+    check_writable(path)
     if kind == ".gif":
         check_value("fps of a gif", shot.fps, number(high=FASTEST))
     if kind == ".mp4":

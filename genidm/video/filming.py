@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from genidm import controller
+from genidm import checks, controller
 from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Steering, Test
@@ -261,6 +261,7 @@ def film_run(
         if test:
             return film_tested(robot, test, episodes, seconds, title)
         return film_test(robot, controller.load(run, robot), starts, seed, seconds, title)
+    check_value("seed", seed, checks.seed())
     keys = jax.random.split(jax.random.key(seed), highest)[np.asarray(starts)]
     settings = Follow(steps(robot, seconds, Follow.max_steps), reach)
     steering = controller.load(run, robot)
