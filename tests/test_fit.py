@@ -191,6 +191,18 @@ def test_a_fit_learns_a_linear_map(latent_size: int | None) -> None:
     assert error < 0.01 * expected.var()
 
 
+@pytest.mark.parametrize("decay", [True, False])
+def test_the_learning_rate_falls_along_a_cosine_unless_it_stays(decay: bool) -> None:
+    """Adam's step under a gradient that stays is the learning rate, whatever its length."""
+    optimizer = Fit(updates=40, learning_rate=3e-3, decay=decay).optimizer()
+    state, steps = optimizer.init(jnp.zeros(1)), []
+    for _ in range(40):
+        step, state = optimizer.update(jnp.full(1, 7.0), state)
+        steps.append(-step[0])
+    expected = 3e-3 * (1 + np.cos(np.pi * np.arange(40) / 40)) / 2 if decay else 3e-3
+    np.testing.assert_allclose(steps, expected, rtol=1e-4, atol=1e-8)
+
+
 def test_what_a_fit_reports_falls(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "fit", {})
     settings = Fit(300, 64, 3e-3, idm=(16,), lfm=(16,), latent_size=4)
