@@ -460,7 +460,7 @@ def test_what_cannot_be_written_is_refused_before_there_is_a_film(
 
 
 def test_checking_leaves_no_file(tmp_path: Path) -> None:
-    shot = video.check(str(tmp_path / "new" / "a.html"), width=99)
+    shot = video.check(str(tmp_path / "new" / "a.html"), width=99)  # and a str is a path
     assert shot.width == 99 and [p.name for p in tmp_path.rglob("*")] == ["new"]
 
 

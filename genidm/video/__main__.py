@@ -43,7 +43,7 @@ def main(
       seconds: an episode that is longer ends here.
       width: pixels of a picture; 320 in a gif, 640 in an mp4, unless given.
       height: pixels; 240 and 480, unless given.
-      fps: pictures a second; 12.5 and 25, unless given.
+      fps: pictures a second, at most 50 in a gif; 12.5 and 25, unless given.
       engine: "mjx" or "mujoco"; that of the run, unless given.
 
     Raises:

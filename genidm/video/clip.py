@@ -72,9 +72,10 @@ def mp4(pictures: Iterable[np.ndarray], fps: float) -> bytes:
             with contextlib.suppress(BrokenPipeError):  # it says why at its end
                 for picture in itertools.chain([first], pictures):
                     ffmpeg.stdin.write(picture.tobytes())
-            said = ffmpeg.communicate()[1].decode(errors="replace")
+            said = " ".join(ffmpeg.communicate()[1].decode(errors="replace").split())
         if ffmpeg.returncode:
-            raise BadInput(f"ffmpeg cannot encode the mp4 in {folder}: {' '.join(said.split())}")
+            why = said or f"exit status {ffmpeg.returncode}"
+            raise BadInput(f"ffmpeg cannot encode the mp4 in {folder}: {why}")
         return path.read_bytes()
 
 
