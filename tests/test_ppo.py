@@ -362,7 +362,7 @@ def test_a_torn_record_is_not_gone_on_from(killed) -> None:
 
 
 def test_a_learner_of_nan_is_refused_and_nothing_is_marked_done(tmp_path: Path) -> None:
-    agent = dataclasses.replace(AGENT, learning_rate=1e30)
+    agent = Prepared(dataclasses.replace(AGENT, learning_rate=1e30))
     stage = Stage.open(tmp_path, "collect", {})
 
     def work() -> dict:

@@ -201,11 +201,12 @@ def test_killed_at_any_moment_old_or_new_is_there(tmp_path: Path, monkeypatch) -
         assert step in (4, 8)
         same(back, tree(step))
         seen.add(step)
-        again = Remembering(Checkpoints(directory))
-        again.latest(LIKE)
-        again.save(8, tree(8))
-        same(found(directory), (8, tree(8)))
-        assert spans(directory) == [(0, 6), (6, 12), (12, 24)]
+        if at % 5 == 0:
+            again = Remembering(Checkpoints(directory))
+            again.latest(LIKE)
+            again.save(8, tree(8))
+            same(found(directory), (8, tree(8)))
+            assert spans(directory) == [(0, 6), (6, 12), (12, 24)]
     assert at > 20 and seen == {4, 8}
     same(found(directory), (8, tree(8)))
 
