@@ -17,6 +17,7 @@ from in_c import assert_close, placed, positive_w, step_in_c
 
 from experiments import evaluate, physics, train
 from genidm import controller, engines, robots
+from genidm.config import plain
 from genidm.engines import ENGINES, Engine, Physics
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import Test
@@ -223,7 +224,7 @@ def test_every_robot_with_a_model_takes_it_and_none_gets_it_unasked(loop: type[E
     assert engines.choose(None, Ant.engines, "ant") in ("mjx", "mujoco")
     assert engines.choose(None, by_name("ant", "mujoco").engines, "ant") != "loop"
     settings = by_name("ant", "loop").settings
-    assert isinstance(remade(settings).engine, loop)
+    assert isinstance(remade(plain(settings)).engine, loop)
 
 
 # ── the registries ──────────────────────────────────────────────────────────────────────────
