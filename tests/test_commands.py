@@ -168,9 +168,9 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
     assert one == again and one["journeys"] == 2 and len(one["reached"]) == 5
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
     assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
-    for wrong, why in (((), "of a run"), (runs, "robots must")):
+    for wrong, robots, why in (((), 1, "of a run"), (runs, 0, "robots must")):
         with pytest.raises(BadInput, match=why):
-            waypoints.main(wrong, robots=0, out=tmp_path)
+            waypoints.main(wrong, robots=robots, out=tmp_path)
     with pytest.raises(BadInput, match="an even number, not 3"):
         waypoints.main(runs, (3.0, 0.0, 5.0), out=tmp_path)
 

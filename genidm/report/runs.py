@@ -32,6 +32,8 @@ class Tested:
       summary: what it was finished with.
     """
 
+    __test__ = False  # not a test case for pytest
+
     directory: Path
     summary: dict[str, Any]
 
