@@ -34,20 +34,20 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installed. For python to mean this one, here: source $(VENV)/bin/activate"
 
 demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
-	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --out runs/demo
+	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --run-dir runs/demo
 
 # In a directory of its own, where a method has one run. Days on two cores; killed, it goes on.
 results: $(STAMP)  ## every table, figure and number in experiments/results anew, in RESULTS (docs/runs.md)
 	@set -e; \
 	for robot in ant humanoid minitaur; do \
 	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --out $(RESULTS) \
-	    --results experiments/results; \
+	    --report-dir experiments/results; \
 	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-* $(RESULTS)/$$robot/GE-0-* \
-	    $(RESULTS)/$$robot/VGCP-0-* $(RESULTS)/$$robot/HF-0-* --reach 1 --out experiments/results; \
+	    $(RESULTS)/$$robot/VGCP-0-* $(RESULTS)/$$robot/HF-0-* --goal-radius 1 --out experiments/results; \
 	  $(BIN)/python -m experiments.benchmark --robot $$robot; \
 	done; \
-	$(BIN)/python -m experiments.humanoid_world --out $(RESULTS) --results experiments/results; \
-	$(BIN)/python -m experiments.latent_size --out $(RESULTS) --results experiments/results; \
+	$(BIN)/python -m experiments.humanoid_world --out $(RESULTS) --report-dir experiments/results; \
+	$(BIN)/python -m experiments.latent_size --out $(RESULTS) --report-dir experiments/results; \
 	$(BIN)/python -m experiments.physics; \
 	$(BIN)/python -m experiments.physics --robot humanoid; \
 	$(BIN)/python -m experiments.minitaur_physics; \

@@ -8,12 +8,12 @@ from typing import Annotated
 import tyro
 
 from genidm.evaluation import sanity
-from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.provenance import code_of, command, environment
 from genidm.report import Row, origin, results, text
 from genidm.runs.cell import saved
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 
 def main(
@@ -22,12 +22,12 @@ def main(
     episodes: int = 1000,
     first_seed: int = 0,
     engine: str | None = None,
-    test: Test = Test(),
+    test: EvaluationSettings = EvaluationSettings(),
 ) -> None:
     """The paper's test (A.1.3) of controllers, on as many scenarios as you like; keeps nothing.
 
     Args:
-      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --out.
+      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --run-dir.
       seeds: test seeds.
       episodes: episodes a seed.
       first_seed: the first of the test seeds; another one gives unseen scenarios.
@@ -38,11 +38,11 @@ def main(
       BadInput: runs of different robots, or none.
     """
     robot, models = saved(runs, engine)
-    bank, rows = scenarios(robot, seeds, episodes, first_seed), []
+    test_scenarios, rows = scenarios(robot, seeds, episodes, first_seed), []
     here = {**environment(), "command": command()}
     tested = origin(code_of("genidm.evaluation.evaluate", robot, robot.engine), [here])
     for name, (model, fitted) in models.items():
-        outcome = evaluate(robot, model, bank, test)
+        outcome = evaluate(robot, model, test_scenarios, test)
         sanity.walked(name, outcome)
         told = {key: fitted[key] for key in ("interactions", "replayed", "settings")}
         rows.append(Row(method=name, episodes=outcome, made={"test": tested}, **told))
@@ -51,10 +51,10 @@ def main(
         robot=robot.name,
         engine=robot.engine,
         scale="test",
-        scenarios=bank.digest(),
+        scenarios=test_scenarios.digest(),
     )
     print(text(written))
 
 
 if __name__ == "__main__":
-    guarded(main, "Tests saved controllers again.")
+    run_cli(main, "Tests saved controllers again.")

@@ -18,9 +18,9 @@ from experiments import table1
 from genidm.experience import Experience
 from genidm.paper.methods import by_name
 from genidm.robots import Humanoid, HumanoidWorld
-from genidm.runs.cell import cell
-from genidm.runs.command import guarded
-from genidm.runs.run import InverseCell
+from genidm.runs.cell import make_run
+from genidm.runs.command import run_cli
+from genidm.runs.run import InverseDynamicsRun
 
 METHODS = ("RL", "GE", "LR")
 
@@ -33,16 +33,16 @@ def in_world(s: np.ndarray) -> np.ndarray:
     """
     heading, world, x = Humanoid().observation, HumanoidWorld().observation, jnp.asarray(s)
     yaw = heading.yaw(x)
-    return np.asarray(world.turn(heading.turn(x, -yaw), yaw))
+    return np.asarray(world.rotate(heading.rotate(x, -yaw), yaw))
 
 
 def record(options: table1.Table) -> Experience:
     """The Humanoid's record in the place of HumanoidWorld's; collected, unless it is there."""
     lr = by_name("LR", Humanoid.name)
     source, target = (
-        cell(robot(engine=options.engine), lr, options) for robot in (Humanoid, HumanoidWorld)
+        make_run(robot(engine=options.engine), lr, options) for robot in (Humanoid, HumanoidWorld)
     )
-    assert isinstance(source, InverseCell) and isinstance(target, InverseCell)
+    assert isinstance(source, InverseDynamicsRun) and isinstance(target, InverseDynamicsRun)
     stage = target.experience_stage
 
     def work() -> dict[str, Any]:
@@ -51,7 +51,7 @@ def record(options: table1.Table) -> Experience:
         seen.save(stage.path("experience") / "chunk_00000", overwrite=True)
         return source.experience_stage.summary()
 
-    stage.once(work)
+    stage.run_once(work)
     return target.experience()
 
 
@@ -64,4 +64,4 @@ def main(
 
 
 if __name__ == "__main__":
-    guarded(main, "The Humanoid with its velocity in the world's frame: RL, GE and LR.")
+    run_cli(main, "The Humanoid with its velocity in the world's frame: RL, GE and LR.")

@@ -9,21 +9,21 @@ from typing import Annotated, Any
 import tyro
 
 from genidm import files
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import LR, Inverse
+from genidm.paper.methods import LR, InverseDynamics
 from genidm.provenance import environment
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
 from genidm.report.runs import Tested
 from genidm.robots import Robot, by_name
-from genidm.runs.cell import announce, bank_of, cell, film_cell
-from genidm.runs.command import guarded
+from genidm.runs.cell import announce, make_run, render_run, scenarios_of
+from genidm.runs.command import run_cli
 from genidm.runs.resolve import Options
-from genidm.runs.run import InverseCell
+from genidm.runs.run import InverseDynamicsRun
 
 KIND = "latent_size"  # of the tests, which are no rows of the table
 
@@ -49,7 +49,7 @@ class Sweep(Options):
             raise BadInput("the figure needs repeats, and sizes, of at least 1")
 
 
-def sized(method: Inverse, k: int) -> Inverse:
+def sized(method: InverseDynamics, k: int) -> InverseDynamics:
     """The method with a latent of another size, under a name of its own."""
     if k == method.fit.latent_size:
         return method
@@ -57,17 +57,19 @@ def sized(method: Inverse, k: int) -> Inverse:
     return dataclasses.replace(method, name=f"{method.name} k={k}", fit=fit)
 
 
-def cells(robot: Robot, method: Inverse, options: Sweep) -> dict[int, list[InverseCell]]:
+def cells(
+    robot: Robot, method: InverseDynamics, options: Sweep
+) -> dict[int, list[InverseDynamicsRun]]:
     """k → its cells, one a fit. The first fit with the method's own k is that of Table 1."""
-    found: dict[int, list[InverseCell]] = {}
+    found: dict[int, list[InverseDynamicsRun]] = {}
     for k in sorted(set(options.sizes)):
-        this = cell(robot, sized(method, k), options)
-        assert isinstance(this, InverseCell)
+        this = make_run(robot, sized(method, k), options)
+        assert isinstance(this, InverseDynamicsRun)
         found[k] = [dataclasses.replace(this, repeat=r) for r in range(options.repeats)]
     return found
 
 
-def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
+def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
     """Fits and tests every k that is not done; then writes the numbers and the figure.
 
     Args:
@@ -81,11 +83,13 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
     of = cells(robot, method, options)
     announce(robot, options.engine)
     first = next(iter(of.values()))[0]
-    bank = bank_of(first, options)
-    tests = {k: [tested(this, bank, options.video) for this in these] for k, these in of.items()}
-    written = document(first, method, bank, tests)
+    scenarios = scenarios_of(first, options)
+    tests = {
+        k: [tested(this, scenarios, options.video) for this in these] for k, these in of.items()
+    }
+    written = document(first, method, scenarios, tests)
     here = first.root / f"{KIND}-{first.scale.name}"
-    for directory in (here, options.results):
+    for directory in (here, options.report_dir):
         if directory:
             files.save_json(Path(directory) / f"{robot.name}_{KIND}.json", written)
             closest = {k: [stats.masked(t) for t in fits] for k, fits in tests.items()}
@@ -95,16 +99,19 @@ def run(robot: Robot, method: Inverse, options: Sweep) -> Path:
     return here
 
 
-def tested(this: InverseCell, bank: Scenarios, video: bool) -> Episodes:
+def tested(this: InverseDynamicsRun, scenarios: Scenarios, video: bool) -> Episodes:
     """A fit's test, made unless it is there, and its video, if that is asked for."""
-    stage = this.episodes(bank, KIND)
+    stage = this.run_test(scenarios, KIND)
     if video:
-        film_cell(this)
+        render_run(this)
     return Tested(stage.directory, stage.summary()).episodes
 
 
 def document(
-    first: InverseCell, method: Inverse, bank: Scenarios, tests: dict[int, list[Episodes]]
+    first: InverseDynamicsRun,
+    method: InverseDynamics,
+    scenarios: Scenarios,
+    tests: dict[int, list[Episodes]],
 ) -> dict[str, Any]:
     """The figure as one JSON document, distances in metres.
 
@@ -117,11 +124,11 @@ def document(
         "robot": first.robot.name,
         "scale": first.scale.name,
         "training_seed": first.seed,
-        "scenarios": bank.digest(),
+        "scenarios": scenarios.digest(),
         "experience": first.experience_stage.directory.name,
         "versions": found["versions"],
         "hardware": found["hardware"],
-        "settings": plain(method),
+        "settings": to_json(method),
         "sizes": jsonable({k: size(fits) for k, fits in tests.items()}, digits=6),
     }
 
@@ -154,4 +161,4 @@ def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> 
 
 
 if __name__ == "__main__":
-    guarded(latent_size, "Closest distance against the size of the latent (Fig. 9).")
+    run_cli(latent_size, "Closest distance against the size of the latent (Fig. 9).")

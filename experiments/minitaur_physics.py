@@ -1,7 +1,7 @@
 """The Minitaur in PyBullet: what its settings cost, how it walks under them, how turnable it is.
 
     python -m experiments.minitaur_physics         # minutes; what it says is in docs/physics.md
-    python -m experiments.minitaur_physics --lanes 4
+    python -m experiments.minitaur_physics --num-envs 4
 
 Speeds of a single robot are in CPU time; those of several processes are
 `experiments.minitaur_processes`'.
@@ -38,7 +38,7 @@ from genidm.robots.minitaur_world import (
     parts,
     stepped,
 )
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 ORIGINAL = Solver(iterations=60, self_collision=True, cone=True)
 OURS = Solver()
@@ -55,19 +55,19 @@ class Options:
     """What is measured.
 
     Attributes:
-      lanes: robots that a number is the mean or the median of.
+      num_envs: robots that a number is the mean or the median of.
       seed: of shakes, actions and yaws.
       out: the JSON file.
     """
 
-    lanes: int = 32
+    num_envs: int = 32
     seed: int = 0
     out: Path | str = Path("experiments/results/minitaur_physics.json")
 
     def check(self) -> None:
         """Raises BadInput for what cannot be measured."""
-        if self.lanes < 1:
-            raise BadInput("--lanes must be at least 1")
+        if self.num_envs < 1:
+            raise BadInput("--num-envs must be at least 1")
 
 
 def gait() -> np.ndarray:
@@ -181,17 +181,17 @@ class Jobs:
 def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
     """How far a turned replay is from the replay, turned: a row for each start, cone and action."""
     rng, rows = np.random.default_rng(options.seed), []
-    yaw = rng.uniform(-np.pi, np.pi, options.lanes)
+    yaw = rng.uniform(-np.pi, np.pi, options.num_envs)
     told = {
-        "trot": [gait()] * options.lanes,
-        "random": [shakes(rng, STEPS) for _ in range(options.lanes)],
+        "trot": [gait()] * options.num_envs,
+        "random": [shakes(rng, STEPS) for _ in range(options.num_envs)],
     }
     for cone in (False, True):
-        solver = [dataclasses.replace(OURS, cone=cone)] * options.lanes
+        solver = [dataclasses.replace(OURS, cone=cone)] * options.num_envs
         for start in ("hard reset", "placed"):
             for name, actions in told.items():
                 straight, turned = replays(jobs, start, solver, yaw, actions)
-                exact = symmetry.turn_vector(jnp.asarray(straight), jnp.asarray(yaw)[:, None])
+                exact = symmetry.rotate_vector(jnp.asarray(straight), jnp.asarray(yaw)[:, None])
                 apart = np.linalg.norm(np.asarray(exact) - turned, axis=-1)[:, np.array(LOOK) - 1]
                 rows.append(
                     {
@@ -213,7 +213,7 @@ def replays(
         lambda x: jnp.tile(x, (len(yaw), 1)), from_rows(jnp.asarray(row, jnp.float32))
     )
     robot = Minitaur(solver[0])
-    turned = (robot.turn_physics(physics, jnp.asarray(way)) for way in (0 * yaw, yaw))
+    turned = (robot.rotate_physics(physics, jnp.asarray(way)) for way in (0 * yaw, yaw))
     starts = (np.concatenate(jax.tree.leaves(jax.device_get(p)), axis=-1) for p in turned)
     return (jobs(placed, solver, list(rows), actions) for rows in starts)
 
@@ -233,7 +233,7 @@ WALKERS = {
 def fidelity(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
     """The same walk under other settings: mean and standard error over the lanes."""
     rows, names = [], ("ahead", "height", "pitch", "steps", "ms")
-    seeds = [options.seed + lane for lane in range(options.lanes)]
+    seeds = [options.seed + lane for lane in range(options.num_envs)]
     for name, (solver, anew) in WALKERS.items():
         walks = jobs(walk, [solver] * len(seeds), [anew] * len(seeds), seeds)
         error = walks.std(0) / np.sqrt(len(walks))
@@ -314,4 +314,4 @@ def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Optio
 
 
 if __name__ == "__main__":
-    guarded(minitaur_physics, "Speed, fidelity and turnability of the Minitaur in PyBullet.")
+    run_cli(minitaur_physics, "Speed, fidelity and turnability of the Minitaur in PyBullet.")

@@ -38,13 +38,13 @@ class Vectorised:
 
     Attributes:
       name: of what steps them.
-      lanes: robots.
+      num_envs: robots.
       pids: of the processes.
       step: steps them all once, and waits for it.
     """
 
     name: str
-    lanes: int
+    num_envs: int
     pids: list[int]
     step: Callable[[], Any]
 
@@ -58,7 +58,7 @@ class Vectorised:
             spent = busy(self.pids) - before
             slowest += spent.sum(0).max()
             cpu += spent[0].sum()
-        steps = self.lanes * repeats
+        steps = self.num_envs * repeats
         return {
             "steps_per_second": steps / wall,
             "ms_cpu": 1e3 * cpu / steps,
@@ -79,9 +79,9 @@ def vectorised(actions: np.ndarray) -> list[dict[str, Any]]:
     with contextlib.ExitStack() as opened:
         kinds = [ours(n, actions) for n in counts]
         kinds += [opened.enter_context(gymnasiums(n, actions)) for n in counts]
-        rounds = [[kind.measured(ROUND // kind.lanes) for kind in kinds] for _ in range(ROUNDS)]
+        rounds = [[kind.measured(ROUND // kind.num_envs) for kind in kinds] for _ in range(ROUNDS)]
     return [
-        {"what": kind.name, "processes": len(kind.pids), "lanes": kind.lanes}
+        {"what": kind.name, "processes": len(kind.pids), "lanes": kind.num_envs}
         | {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
         for kind, rows in zip(kinds, zip(*rounds, strict=True), strict=True)
     ]

@@ -29,12 +29,12 @@ from genidm import devices, files, symmetry
 from genidm.engines import ENGINES, Physics
 from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
-from genidm.progress import Progress, compiled
+from genidm.progress import Progress, compile_ahead
 from genidm.provenance import environment
 from genidm.robots import ROBOTS, State
 from genidm.robots.base import select
 from genidm.robots.mujoco import MujocoRobot, Solver
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 OURS = Solver(iterations=4, line_search=8, elliptic=True)
 SETTINGS = (
@@ -77,14 +77,14 @@ class Options:
     Attributes:
       robot: by its name; one with a MuJoCo model.
       steps: control steps of elliptic 4/8; the other settings are given 0.128 of them.
-      lanes: robots at once; a multiple of the number of devices.
+      num_envs: robots at once; a multiple of the number of devices.
       seed: of starts, actions and yaws.
       out: the JSON file; under experiments/results, unless given.
     """
 
     robot: str = "ant"
     steps: int = 1_000_000
-    lanes: int = 128
+    num_envs: int = 128
     seed: int = 0
     out: Path | str | None = None
 
@@ -95,10 +95,10 @@ class Options:
             raise BadInput(
                 f"no robot {self.robot!r} has a MuJoCo model; {', '.join(modelled)} have"
             )
-        if min(self.steps, self.lanes) < 1:
-            raise BadInput("--steps and --lanes must be at least 1")
-        if self.lanes % jax.device_count():
-            raise BadInput(f"--lanes must be a multiple of {jax.device_count()}, one a device")
+        if min(self.steps, self.num_envs) < 1:
+            raise BadInput("--steps and --num-envs must be at least 1")
+        if self.num_envs % jax.device_count():
+            raise BadInput(f"--num-envs must be a multiple of {jax.device_count()}, one a device")
 
     def with_solver(self, solver: Solver, engine: str) -> MujocoRobot:
         """The robot on that engine, under these settings of the solver."""
@@ -108,7 +108,7 @@ class Options:
     def episodes(self, solver: Solver) -> int:
         """Episodes of every lane: the steps asked for, rounded up."""
         steps = self.steps if solver == OURS else OTHERS * self.steps
-        return math.ceil(steps / (self.lanes * EPISODE))
+        return math.ceil(steps / (self.num_envs * EPISODE))
 
 
 def as_run() -> list[Precision]:
@@ -138,17 +138,21 @@ def endure(robot: MujocoRobot, name: str, episodes: int, options: Options) -> di
     """
     mesh = robot.mesh()
     seeds = jax.random.split(jax.random.key(options.seed), episodes)
-    lanes = [devices.put(jax.random.split(seed, options.lanes), mesh) for seed in seeds]
+    lanes = [devices.put(jax.random.split(seed, options.num_envs), mesh) for seed in seeds]
     program = jax.jit(devices.over_lanes(shaken(robot), mesh, [0], 0))
-    run = compiled(name, program, lanes[0])
+    run = compile_ahead(name, program, lanes[0])
     run(lanes[0]).block_until_ready()  # the first call also touches fresh memory
     blow_ups, began = 0, time.perf_counter()
-    with Progress(name, episodes * EPISODE * options.lanes, "steps") as bar:
+    with Progress(name, episodes * EPISODE * options.num_envs, "steps") as bar:
         for keys in lanes:
             blow_ups += int(run(keys).sum())
-            bar.advance(EPISODE * options.lanes)
+            bar.advance(EPISODE * options.num_envs)
     seconds = time.perf_counter() - began
-    return {"steps": episodes * EPISODE * options.lanes, "blow_ups": blow_ups, "seconds": seconds}
+    return {
+        "steps": episodes * EPISODE * options.num_envs,
+        "blow_ups": blow_ups,
+        "seconds": seconds,
+    }
 
 
 def shaken(robot: MujocoRobot) -> Callable[[jax.Array], jax.Array]:
@@ -193,7 +197,7 @@ def walked(
         state = robot.step(state, action)
         return state, state.position
 
-    state, positions = jax.lax.scan(step, robot.place(physics, yaw), actions)
+    state, positions = jax.lax.scan(step, robot.set_state(physics, yaw), actions)
     return state.physics, positions
 
 
@@ -201,9 +205,9 @@ def starts(options: Options) -> Physics:
     """Physics `[B, ...]` of robots that have been shaken for a second, in float32's numbers."""
     robot = options.with_solver(OURS, MuJoCo.name)
     fresh, shakes = jax.random.split(jax.random.key(options.seed))
-    still = jnp.zeros(options.lanes)
-    state = robot.reset(jax.random.split(fresh, options.lanes), still)
-    actions = strong(shakes, (WARM_UP, options.lanes, robot.action.size))
+    still = jnp.zeros(options.num_envs)
+    state = robot.reset(jax.random.split(fresh, options.num_envs), still)
+    actions = strong(shakes, (WARM_UP, options.num_envs, robot.action.size))
     shake = jax.jit(functools.partial(walked, robot))
     return jax.tree.map(np.asarray, shake(state.physics, still, actions)[0])
 
@@ -219,19 +223,19 @@ def drift(
     run = jax.jit(devices.over_lanes(walk, robot.mesh(), [0, 0, 1], 1))
     with jax.enable_x64(dtype == "float64"):
         start, turn, a = jax.tree.map(lambda x: jnp.asarray(x, dtype), (start, yaw, actions))
-        exact = symmetry.turn_vector(run(start, jnp.zeros_like(turn), a), turn)
+        exact = symmetry.rotate_vector(run(start, jnp.zeros_like(turn), a), turn)
         return np.linalg.norm(run(start, turn, a) - exact, axis=-1)
 
 
 def drifts(options: Options) -> list[dict[str, Any]]:
     """A row for each cone and precision: median and 90th percentile over the lanes."""
     start, rng = starts(options), np.random.default_rng(options.seed + 1)
-    yaw = rng.uniform(-np.pi, np.pi, options.lanes)
+    yaw = rng.uniform(-np.pi, np.pi, options.num_envs)
     rows = []
     for solver in (s for s in SETTINGS if s.iterations == OURS.iterations):
         for precision in (*as_run(), UNROUNDED):
             robot = options.with_solver(solver, precision.engine)
-            shape = (max(LOOK), options.lanes, robot.action.size)
+            shape = (max(LOOK), options.num_envs, robot.action.size)
             actions = np.asarray(strong(jax.random.key(options.seed + 2), shape))
             apart = drift(robot, precision.dtype, start, yaw, actions)[np.array(LOOK) - 1]
             rows.append(
@@ -301,4 +305,4 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
 
 
 if __name__ == "__main__":
-    guarded(physics, "Stability, speed and turnability of a robot's physics.")
+    run_cli(physics, "Stability, speed and turnability of a robot's physics.")

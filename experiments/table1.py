@@ -15,16 +15,16 @@ import tyro
 from genidm.checks import check, count
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import EXTRA, ORDER, Direct, Inverse, by_name
+from genidm.paper.methods import EXTRA, ORDER, GoalConditioned, InverseDynamics, by_name
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
-from genidm.runs.cell import announce, bank_of, cell, film_cell, write_report
-from genidm.runs.command import guarded
+from genidm.runs.cell import announce, make_run, render_run, scenarios_of, write_report
+from genidm.runs.command import run_cli
 from genidm.runs.resolve import Options
-from genidm.runs.run import Cell
+from genidm.runs.run import Run
 from genidm.store import Stage
 
-Methods = Sequence[Direct | Inverse]
+Methods = Sequence[GoalConditioned | InverseDynamics]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,38 +33,38 @@ class Table(Options):
 
     Attributes:
       robot: ant, humanoid, humanoid_world or minitaur.
-      methods: the rows to make; what lies under `out` already stands in the table, too.
-      extra: also the rows that the paper does not have (HF); off, they are left out.
+      methods: the rows to make; what lies under `run_dir` already stands in the table, too.
+      include_hf: also the rows that the paper does not have (HF); off, they are left out.
       seeds: how many training seeds, from `seed` on. The first makes the rows; the spread
         over all of them stands beside.
-      spread_episodes: test episodes a test seed with the later training seeds.
+      episodes_per_extra_seed: test episodes a test seed with the later training seeds.
     """
 
     robot: str = "ant"
     methods: tuple[str, ...] = ORDER
-    extra: bool = True
+    include_hf: bool = True
     seeds: int = 1
-    spread_episodes: int = 200
+    episodes_per_extra_seed: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, seeds=count(), spread_episodes=count())
+        check(self, seeds=count(), episodes_per_extra_seed=count())
 
 
-def chosen(options: Table) -> list[Direct | Inverse]:
+def chosen(options: Table) -> list[GoalConditioned | InverseDynamics]:
     """The methods that a user named.
 
     Raises:
       BadInput: there is no such method, or none is left.
     """
     rows = [by_name(name, options.robot) for name in dict.fromkeys(options.methods)]
-    rows = rows if options.extra else [row for row in rows if row.name not in EXTRA]
+    rows = rows if options.include_hf else [row for row in rows if row.name not in EXTRA]
     if not rows:
         raise BadInput(f"no method to run; there are: {', '.join(ORDER)}")
     return rows
 
 
-def grouped(methods: Methods) -> list[Direct | Inverse]:
+def grouped(methods: Methods) -> list[GoalConditioned | InverseDynamics]:
     """Methods that learn from one agent's experience together: it is collected by the first."""
     sources = [(method.agent, method.task) for method in methods]
     return sorted(methods, key=lambda method: sources.index((method.agent, method.task)))
@@ -75,35 +75,40 @@ class Work:
     """A cell to run, and what it is tested on.
 
     Attributes:
-      cell: what is run.
-      bank: the scenarios of its test.
+      run: what is run.
+      scenarios: the scenarios of its test.
       whole: those of the table's rows. Where the cell has been tested on them already, that
         test stands, so that a table does not depend on which command came first.
     """
 
-    cell: Cell[Any]
-    bank: Scenarios
+    run: Run[Any]
+    scenarios: Scenarios
     whole: Scenarios
 
-    def run(self) -> Stage:
+    def execute(self) -> Stage:
         """The finished test."""
-        done = self.cell.test_stage(self.whole).done
-        return self.cell.episodes(self.whole if done else self.bank)
+        done = self.run.test_stage(self.whole).done
+        return self.run.run_test(self.whole if done else self.scenarios)
 
     def __str__(self) -> str:
-        return f"{self.cell.method.name}, training seed {self.cell.seed}"
+        return f"{self.run.method.name}, training seed {self.run.seed}"
 
 
 def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
-    """The cells of the table, seed by seed; the later ones on the beginning of the bank."""
+    """The cells of the table, seed by seed; the later ones on the first of the scenarios."""
     numbers = range(options.seed, options.seed + options.seeds)
     seeds = [dataclasses.replace(options, seed=seed) for seed in numbers]
-    first, *later = ([cell(robot, m, these) for m in grouped(methods)] for these in seeds)
-    bank = few = bank_of(first[0], options)
-    if later and options.spread_episodes < bank.shape[1]:
-        few = bank_of(first[0], dataclasses.replace(options, episodes=options.spread_episodes))
+    first, *later = ([make_run(robot, m, these) for m in grouped(methods)] for these in seeds)
+    scenarios = few = scenarios_of(first[0], options)
+    if later and options.episodes_per_extra_seed < scenarios.shape[1]:
+        few = scenarios_of(
+            first[0], dataclasses.replace(options, episodes=options.episodes_per_extra_seed)
+        )
     rest = itertools.chain(*later)
-    return [*(Work(this, bank, bank) for this in first), *(Work(this, few, bank) for this in rest)]
+    return [
+        *(Work(this, scenarios, scenarios) for this in first),
+        *(Work(this, few, scenarios) for this in rest),
+    ]
 
 
 def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, list[Exception]]:
@@ -133,18 +138,18 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
             failures.append(made)
             continue
         tests.append(made)
-        if item.bank is first.bank:
+        if item.scenarios is first.scenarios:
             ended = True
             if options.video:
-                film_cell(item.cell)
-    report = write_report(first.cell, first.bank, options, tests) if ended else None
+                render_run(item.run)
+    report = write_report(first.run, first.scenarios, options, tests) if ended else None
     return report, failures
 
 
 def attempt(item: Work) -> Stage | Exception:
     """Runs a cell to its end; or what it failed with, once that is said on stderr."""
     try:
-        return item.run()
+        return item.execute()
     except BadInput as error:
         print(f"error: {item}: {error}", file=sys.stderr)
         return error
@@ -166,4 +171,4 @@ def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
 
 
 if __name__ == "__main__":
-    guarded(table1, "Table 1: every method on one robot, and the spread over training seeds.")
+    run_cli(table1, "Table 1: every method on one robot, and the spread over training seeds.")

@@ -12,7 +12,7 @@ from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import walking_speed
 from genidm.evaluation.scenarios import MOST_EPISODES
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 
 def main(
@@ -42,4 +42,4 @@ def main(
 
 
 if __name__ == "__main__":
-    guarded(main, "How fast the agents walk that collected.")
+    run_cli(main, "How fast the agents walk that collected.")

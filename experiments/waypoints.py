@@ -12,12 +12,12 @@ import tyro
 
 from genidm import checks, files
 from genidm.checks import check_value, count, number
-from genidm.evaluation.waypoints import Follow, Journeys, follow, in_twos
+from genidm.evaluation.waypoints import WaypointRuns, WaypointSettings, follow_waypoints, in_twos
 from genidm.provenance import environment
-from genidm.report import journeys
+from genidm.report import draw_waypoint_runs
 from genidm.report.rows import jsonable
 from genidm.runs.cell import saved
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 # Metres. It goes ahead, turns both ways, and comes back facing where it started from.
 LOOP = (3.0, 0.0, 5.0, 2.0, 4.0, 5.0, 0.0, 5.0, -2.0, 2.0)
@@ -31,12 +31,12 @@ def main(
     seed: int = 0,
     engine: str | None = None,
     out: Path = Path("runs/waypoints"),
-    settings: Annotated[Follow, tyro.conf.arg(name="")] = Follow(),
+    settings: Annotated[WaypointSettings, tyro.conf.arg(name="")] = WaypointSettings(),
 ) -> None:
     """Leads robots through waypoints, one controller after another from the same starts.
 
     Args:
-      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --out.
+      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --run-dir.
       waypoints: x and y of each, metres; starts are near the origin.
       robots: journeys of each controller.
       yaw: radians, that the starts are turned by.
@@ -56,9 +56,9 @@ def main(
     files.check_writable(out, directory=True)
     robot, models = saved(runs, engine)
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
-    made = dict[str, Journeys]()
+    made = dict[str, WaypointRuns]()
     for name, (model, _) in models.items():
-        made[name] = follow(robot, model, points, keys, turned, settings=settings)
+        made[name] = follow_waypoints(robot, model, points, keys, turned, settings=settings)
         print(f"{name}: {sentence(made[name])}")
     summary = {name: one.summary() for name, one in made.items()}
     written = {
@@ -69,22 +69,23 @@ def main(
     }
     name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", written)
-    journeys(made, settings.reach, out / f"{name}.png")
+    draw_waypoint_runs(made, settings.goal_radius, out / f"{name}.png")
     print(f"Numbers and figure: {out / name}.json, .png")
 
 
-def sentence(made: Journeys) -> str:
+def sentence(made: WaypointRuns) -> str:
     """What became of the journeys, in words."""
     found = made.summary()
     whole = made.times[np.isfinite(made.times).all(1), -1]
     took = f", in {whole.mean():.1f} s" if len(whole) else ""
     each = " ".join(str(n) for n in (made.arrival >= 0).sum(0))
     return (
-        f"{len(whole)} of {found['journeys']} through all waypoints{took} ({each} reached each); "
-        f"{found['deviation']:.2f} m from the path, body {np.degrees(found['askew'] or 0):.0f}° "
-        f"from its course, {found['fell']:.0%} fell"
+        f"{len(whole)} of {found['runs']} through all waypoints{took} ({each} reached each); "
+        f"{found['cross_track_error']:.2f} m from the path, "
+        f"body {np.degrees(found['heading_error'] or 0):.0f}° from its course, "
+        f"{found['fell']:.0%} fell"
     )
 
 
 if __name__ == "__main__":
-    guarded(main, "Through waypoints.")
+    run_cli(main, "Through waypoints.")

@@ -24,7 +24,7 @@ from genidm import files
 from genidm.agents.sac import SAC
 from genidm.paper.methods import HER_SP
 from genidm.robots import Ant
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 from genidm.tasks import GoToGoal
 
 try:
@@ -45,7 +45,7 @@ class GoalAnt(gymnasium.Wrapper):
     Observations are dicts: the Ant's own numbers, its position and its goal `[2]`, metres.
 
     Args:
-      task: yaw and bearing of starts and goals, and the reach.
+      task: yaw and bearing of starts and goals, and the goal radius.
       steps: the time limit.
     """
 
@@ -78,15 +78,15 @@ class GoalAnt(gymnasium.Wrapper):
         return seen, reward, fallen or reward == 0.0, late, info
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, infos: Any) -> np.ndarray:
-        """0 within reach, −1 otherwise (A.1.1), `[...]`; HER asks for it again.
+        """0 within the goal radius, −1 otherwise (A.1.1), `[...]`; HER asks for it again.
 
         A fall ends the episode, and is charged −1 for ever: with less to pay it would be best
         to fall at once.
         """
         fallen = np.array([info["fallen"] for info in np.atleast_1d(infos)])
         far = np.linalg.norm(achieved - desired, axis=-1)
-        charge = np.where(fallen, -1 / (1 - HER_SP.agent.discount), -1.0)
-        return np.where(far <= self.task.reach, 0.0, charge.reshape(far.shape))
+        charge = np.where(fallen, -1 / (1 - HER_SP.agent.discounting), -1.0)
+        return np.where(far <= self.task.goal_radius, 0.0, charge.reshape(far.shape))
 
     def _seen(self, observation: np.ndarray) -> Seen:
         position = self.env.unwrapped.data.qpos[:2].copy()
@@ -130,25 +130,29 @@ def learner(env: GoalAnt, seed: int) -> Any:
         "MultiInputPolicy",
         env,
         learning_rate=ours.learning_rate,
-        buffer_size=ours.capacity,
-        learning_starts=ours.warmup,
-        batch_size=ours.batch,
+        buffer_size=ours.max_replay_size,
+        learning_starts=ours.min_replay_size,
+        batch_size=ours.batch_size,
         tau=ours.tau,
-        gamma=ours.discount,
-        train_freq=ours.lanes * ours.unroll // ours.updates,
+        gamma=ours.discounting,
+        train_freq=ours.num_envs * ours.unroll_length // ours.grad_updates_per_step,
         gradient_steps=1,
         replay_buffer_class=sb3.HerReplayBuffer,
         replay_buffer_kwargs={
-            "n_sampled_goal": ours.her.goals, "goal_selection_strategy": ours.her.strategy,
+            "n_sampled_goal": ours.her.n_sampled_goal,
+            "goal_selection_strategy": ours.her.goal_selection_strategy,
             "copy_info_dict": True,
         },
         policy_kwargs={
-            "net_arch": {"pi": list(ours.hidden), "qf": list(ours.critic_hidden)},
+            "net_arch": {
+                "pi": list(ours.policy_hidden_layer_sizes),
+                "qf": list(ours.critic_hidden_layer_sizes),
+            },
             "features_extractor_class": Relative,
         },
         seed=seed,
         device="cpu",
-    )  # fmt: skip
+    )
 
 
 def closest(env: GoalAnt, act: Callable[[Seen], np.ndarray], episodes: int) -> np.ndarray:
@@ -210,4 +214,4 @@ def main(
 
 
 if __name__ == "__main__":
-    guarded(main, "Stable-Baselines3's HER and SAC on gymnasium's Ant, on HER_SP's task.")
+    run_cli(main, "Stable-Baselines3's HER and SAC on gymnasium's Ant, on HER_SP's task.")

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from genidm.controller import pretrained as pretrained
     from genidm.errors import BadInput as BadInput
     from genidm.evaluation.episodes import Episodes as Episodes
-    from genidm.evaluation.evaluate import Test as Test
+    from genidm.evaluation.evaluate import EvaluationSettings as EvaluationSettings
     from genidm.evaluation.evaluate import evaluate as evaluate
     from genidm.evaluation.scenarios import Scenarios as Scenarios
     from genidm.evaluation.scenarios import scenarios as scenarios
-    from genidm.evaluation.waypoints import Follow as Follow
-    from genidm.evaluation.waypoints import follow as follow
+    from genidm.evaluation.waypoints import WaypointSettings as WaypointSettings
+    from genidm.evaluation.waypoints import follow_waypoints as follow_waypoints
     from genidm.experience import Experience as Experience
     from genidm.paper.fit import Fit as Fit
     from genidm.paper.fit import fit as fit
@@ -74,9 +74,9 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "paper.fit": ("fit", "Fit"),
     "controller": ("Controller", "load", "pretrained"),
     "evaluation.scenarios": ("scenarios", "Scenarios"),
-    "evaluation.evaluate": ("evaluate", "Test"),
+    "evaluation.evaluate": ("evaluate", "EvaluationSettings"),
     "evaluation.episodes": ("Episodes",),
-    "evaluation.waypoints": ("follow", "Follow"),
+    "evaluation.waypoints": ("follow_waypoints", "WaypointSettings"),
     "paper.methods": ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR", "HF"),
     "symmetry": ("Layout",),
     "errors": ("BadInput",),

@@ -1,4 +1,4 @@
-"""The newest states of a long stage, written by orbax; the one before stands in for a torn one."""
+"""The newest states of a long stage, written by orbax; the one before replaces a corrupt one."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Checkpoints:
 
     Attributes:
       directory: where they lie.
-      keep: how many steps are kept: two, so that there is one before a torn one.
+      keep: how many steps are kept: two, so that there is one before a corrupt one.
     """
 
     def __init__(self, directory: Path | str, keep: int = 2):
@@ -71,7 +71,7 @@ class Checkpoints:
         return self.directory / f"part_{name}"
 
     def steps(self) -> list[int]:
-        """The steps that are there, oldest first, torn ones too."""
+        """The steps that are there, oldest first, corrupt ones too."""
         found = (re.fullmatch(r"step_(\d+)", p.name) for p in self.directory.glob("step_*"))
         return sorted(int(m[1]) for m in found if m)
 
@@ -79,7 +79,7 @@ class Checkpoints:
     def save(self, step: int, tree: Any, parts: Sequence[str] = ()) -> None:
         """Keeps a tree of arrays (on any devices), typed random keys and Python numbers.
 
-        Steps are saved in order: one that is there and lies beyond `step` is torn, or of a
+        Steps are saved in order: one that is there and lies beyond `step` is corrupt, or of a
         future that a resume has left, and is removed with the old ones, and with the parts that
         no step names any more.
 
@@ -122,14 +122,14 @@ class Checkpoints:
         return {file.stem: np.load(file, mmap_mode="r", allow_pickle=False) for file in found}
 
     def parts(self, step: int) -> dict[str, int]:
-        """The parts that a step names, in order, with their checksums; none of a torn step."""
+        """The parts that a step names, in order, with their checksums; none of a corrupt step."""
         try:
             return files.load_json(self._path(step) / "leaves.json").get("parts", {})
-        except files.Torn:
+        except files.Corrupt:
             return {}
 
     def latest(self, like: Any) -> tuple[int, Any] | None:
-        """The newest step that is not torn, and its tree; None if there is none.
+        """The newest step that is not corrupt, and its tree; None if there is none.
 
         Args:
           like: an example of the tree, or of `jax.ShapeDtypeStruct`s: it gives the
@@ -145,20 +145,20 @@ class Checkpoints:
         for step in reversed(steps := self.steps()):
             try:
                 self._verify(step)
-            except files.Torn as torn:
+            except files.Corrupt as corrupt:
                 then = "beginning anew" if step == steps[0] else "trying the one before it"
-                print(f"warning: {torn}; {then}", file=sys.stderr)
+                print(f"warning: {corrupt}; {then}", file=sys.stderr)
             else:
                 return step, _restore(self._path(step), like)
         return None
 
     def _verify(self, step: int) -> None:
-        """Raises Torn unless a step is whole, and so are its parts, as they were."""
+        """Raises Corrupt unless a step is whole, and so are its parts, as they were."""
         files.verify(self._path(step))
         for name, checksum in self.parts(step).items():
             files.verify(self._part(name))
             if _checksum(self._part(name)) != checksum:
-                raise files.Torn(f"{self._part(name)} is not what {self._path(step)} names")
+                raise files.Corrupt(f"{self._part(name)} is not what {self._path(step)} names")
 
 
 def _checksum(part: Path) -> int:

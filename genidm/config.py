@@ -17,7 +17,7 @@ import numpy as np
 from genidm.errors import BadInput
 
 
-def plain(config: Any) -> Any:
+def to_json(config: Any) -> Any:
     """A config as JSON can hold it.
 
     Dataclasses become dicts that also name their `class`; tuples and arrays, lists; paths
@@ -36,22 +36,22 @@ def plain(config: Any) -> Any:
     if isinstance(config, PurePath):
         return str(config)
     if isinstance(config, np.ndarray | np.generic | jax.Array):
-        return plain(config.tolist())
+        return to_json(config.tolist())
     if isinstance(config, Mapping):
-        return {k if isinstance(k, str) else str(plain(k)): plain(v) for k, v in config.items()}
+        return {k if isinstance(k, str) else str(to_json(k)): to_json(v) for k, v in config.items()}
     if isinstance(config, tuple | list):
-        return [plain(x) for x in config]
+        return [to_json(x) for x in config]
     if hasattr(config, "__qualname__"):
         return str(config.__qualname__)
     if dataclasses.is_dataclass(config):
-        values = {f.name: plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+        values = {f.name: to_json(getattr(config, f.name)) for f in dataclasses.fields(config)}
         return {"class": type(config).__qualname__, **values}
     raise BadInput(f"a {type(config).__name__} cannot stand in a config: {config!r:.80}")
 
 
 def digest(config: Any) -> str:
     """Ten hex digits of the sha256 of the config's canonical JSON: its name in paths."""
-    text = json.dumps(plain(config), sort_keys=True, separators=(",", ":"))
+    text = json.dumps(to_json(config), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from genidm import files, symmetry, trees
 from genidm.agents.policy import Policy, described
 from genidm.checks import WIDEST, check_value, count, layers, one_of, optional, shown
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.paper.idm import Architecture
 from genidm.robots import Robot, by_name
@@ -23,22 +23,24 @@ Frame = Literal["world", "heading"]
 PRETRAINED = Path(__file__).parent / "pretrained"
 
 
-def in_frame(robot: Robot, frame: Frame, s: jax.Array, d: jax.Array) -> tuple[jax.Array, jax.Array]:
+def in_frame(
+    robot: Robot, input_frame: Frame, s: jax.Array, d: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """s `[..., S]` and d `[..., 3]` as a method sees them.
 
     In the "heading" frame the world is turned so that the robot faces +x: the input is
     then exactly invariant to yaw, which is what the LFM learns in the limit.
     """
-    if frame == "world":
+    if input_frame == "world":
         return s, d
     yaw = robot.observation.yaw(s)
-    return robot.observation.turn(s, -yaw), symmetry.turn_vector(d, -yaw)
+    return robot.observation.rotate(s, -yaw), symmetry.rotate_vector(d, -yaw)
 
 
-def direction(displacement: jax.Array) -> jax.Array:
+def direction(relative_goal: jax.Array) -> jax.Array:
     """d, the unit vector of o' − o `[..., 3]` (Remark 2); zero where there is none."""
-    length = jnp.linalg.norm(displacement, axis=-1, keepdims=True)
-    return displacement / jnp.maximum(length, 1e-6)
+    length = jnp.linalg.norm(relative_goal, axis=-1, keepdims=True)
+    return relative_goal / jnp.maximum(length, 1e-6)
 
 
 class Controller(flax.struct.PyTreeNode):
@@ -46,10 +48,10 @@ class Controller(flax.struct.PyTreeNode):
 
     Attributes:
       params: of the models.
-      mean: `[S]`, of the training states, in the method's frame.
+      mean: `[S]`, of the training states, in the method's input frame.
       std: `[S]`.
       architecture: shape of the models.
-      frame: the frame that they see s and d in.
+      input_frame: the frame that they see s and d in.
       robot: the robot that they were fitted for.
     """
 
@@ -57,21 +59,21 @@ class Controller(flax.struct.PyTreeNode):
     mean: jax.Array
     std: jax.Array
     architecture: Architecture = flax.struct.field(pytree_node=False)
-    frame: Frame = flax.struct.field(pytree_node=False)
+    input_frame: Frame = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` in [−1, 1].
 
         Args:
           s: states `[..., S]`.
-          displacement: `[..., 3]`, from the robot to where it should go, metres.
+          relative_goal: `[..., 3]`, from the robot to where it should go, metres.
 
         Raises:
           BadInput: their shapes do not fit the robot, or each other.
         """
-        s = self.robot.heard(s, displacement)
-        s, d = in_frame(self.robot, self.frame, s, direction(displacement))
+        s = self.robot.check_inputs(s, relative_goal)
+        s, d = in_frame(self.robot, self.input_frame, s, direction(relative_goal))
         return jnp.clip(self.action(self.latent(s, d)), -1.0, 1.0)
 
     def normalize(self, s: jax.Array) -> jax.Array:
@@ -79,7 +81,7 @@ class Controller(flax.struct.PyTreeNode):
         return jnp.clip((s - self.mean) / self.std, -10.0, 10.0)
 
     def latent(self, s: jax.Array, d: jax.Array) -> jax.Array:
-        """γ `[..., k]` of states and directions in the method's frame (Eq. 3)."""
+        """γ `[..., k]` of states and directions in the method's input frame (Eq. 3)."""
         return self.architecture.latent(self.params, self.normalize(s), d)
 
     def action(self, latent: jax.Array) -> jax.Array:
@@ -104,7 +106,9 @@ class Controller(flax.struct.PyTreeNode):
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
-        meta = described(self.robot) | {"frame": self.frame} | plain(self.architecture)
+        meta = (
+            described(self.robot) | {"input_frame": self.input_frame} | to_json(self.architecture)
+        )
         files.save_arrays(path, leaves, meta, overwrite)
 
     @classmethod
@@ -123,7 +127,7 @@ class Controller(flax.struct.PyTreeNode):
         architecture = Architecture(
             meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
         )
-        return cls(**tree, architecture=architecture, frame=meta["frame"], robot=robot)
+        return cls(**tree, architecture=architecture, input_frame=meta["input_frame"], robot=robot)
 
 
 def pretrained(robot: str) -> Controller | Policy:
@@ -156,7 +160,7 @@ def load(
       engine: to step that robot with, where none is given; the robot chooses, unless given.
 
     Raises:
-      BadInput: the directory is torn, or the controller is another robot's.
+      BadInput: the directory is corrupt, or the controller is another robot's.
     """
     inside = Path(path) / "controller"
     place = inside if inside.is_dir() else Path(path)
@@ -173,7 +177,7 @@ def load(
     if made_for != robot.name:
         raise BadInput(f"{path} holds a controller for {shown(made_for)}, not for {robot.name}")
     _same_layouts(path, meta, robot)
-    restore = Policy.restore if "directed" in meta else Controller.restore
+    restore = Policy.restore if "goal_conditioned" in meta else Controller.restore
     try:
         made = restore(tree, meta, robot)
         wanted = jax.eval_shape(made.fresh, jax.random.key(0))

@@ -151,7 +151,7 @@ def host_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def at_once(robots: int) -> int:
+def max_parallel_envs(robots: int) -> int:
     """Robots to step at once where no result depends on their number.
 
     On a CPU as many as asked for; on an accelerator more, which few do not keep busy, as far
@@ -161,7 +161,7 @@ def at_once(robots: int) -> int:
     return robots if room is None else max(robots, min(BUSY, room // 4 // ROBOT))
 
 
-def home(size: int) -> jax.Device:
+def pick_device(size: int) -> jax.Device:
     """Where `size` bytes can lie beside a copy of them: the first device, or the host's CPU."""
     room = memory()
     return jax.devices()[0] if room is None or 2.5 * size <= room else jax.devices("cpu")[0]

@@ -14,9 +14,9 @@ import numpy as np
 
 from genidm import files
 from genidm.errors import BadInput
-from genidm.files import Torn
+from genidm.files import Corrupt
 from genidm.robots.base import Robot
-from genidm.tasks import Step
+from genidm.tasks import Transition
 
 # Metres; farther off, float32 rounds a position by more than 0.01 mm.
 FAR = 100.0
@@ -51,14 +51,14 @@ class Experience(flax.struct.PyTreeNode):
         """Number of recorded transitions."""
         return self.first.shape[0] * self.first.shape[1]
 
-    def first_share(self, share: float) -> Experience:
-        """The earliest `share` of the record, in (0, 1]."""
-        steps = max(1, round(self.first.shape[0] * share))
+    def first_fraction(self, fraction: float) -> Experience:
+        """The earliest `fraction` of the record, in (0, 1]."""
+        steps = max(1, round(self.first.shape[0] * fraction))
         return jax.tree.map(lambda x: x[:steps], self)
 
     def first_half(self) -> Experience:
         """What GE and LR learn from (A.1.2)."""
-        return self.first_share(0.5)
+        return self.first_fraction(0.5)
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
         """Writes the record as a directory of arrays, without pickle.
@@ -216,8 +216,8 @@ def _possible(clean: Experience, robot: Robot) -> None:
         t, lane = np.argwhere(np.abs(clean.a) > 1 + 1e-6)[0][:2]
         raise BadInput(f"experience: a lies outside [−1, 1], first in [{t}, {lane}]")
     lane_by_lane = clean.s.swapaxes(0, 1)[clean.valid.T]
-    for flaw in robot.observation.flaws(lane_by_lane):
-        raise BadInput(f"experience: {flaw} (s)")
+    for invalid in robot.observation.invalid_fields(lane_by_lane):
+        raise BadInput(f"experience: {invalid} (s)")
 
 
 def _continuous(clean: Experience, robot: Robot) -> None:
@@ -235,7 +235,7 @@ def _continuous(clean: Experience, robot: Robot) -> None:
     step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
     # Not all of the steps: where a position is put right each second, two in a hundred are jumps.
     usual = np.quantile(step[clean.valid], 0.9)
-    most = max(10 * usual, 5.0 * robot.control_step)
+    most = max(10 * usual, 5.0 * robot.dt)
     gap, steps = _gaps(clean)
     for name, jump, allowed in (("o_next", step, most), ("o", gap, most * steps)):
         beyond = np.where(jump > allowed, jump, 0)
@@ -289,7 +289,7 @@ def _read_otherwise(clean: Experience, robot: Robot) -> None:
             raise BadInput(f"experience: {field.name!r} fits the way of the robot {words} (s)")
 
 
-def record(step: Step) -> Experience:
+def record(step: Transition) -> Experience:
     """The experience in one transition of B lanes, arrays `[B, ...]`."""
     return Experience(
         s=step.before.observation,
@@ -312,7 +312,7 @@ def load(path: Path | str, robot: Robot) -> Experience:
     """A record that `Experience.save` wrote.
 
     Raises:
-      BadInput: the directory is torn, or the record is another robot's.
+      BadInput: the directory is corrupt, or the record is another robot's.
     """
     tree, _ = files.load_arrays(path)
     if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
@@ -337,27 +337,27 @@ def load_chunks(directory: Path, robot: Robot, interactions: int | None = None) 
       interactions: how many there must be; as many as there are, unless given.
 
     Raises:
-      BadInput: a chunk is torn, or missing.
+      BadInput: a chunk is corrupt, or missing.
     """
     chunks = [load(path, robot) for path in sorted(directory.glob("chunk_*"))]
     found = sum(chunk.interactions for chunk in chunks)
     if interactions is not None and found != interactions:
-        raise Torn(
+        raise Corrupt(
             f"{directory} holds {found} of {interactions} interactions: a chunk is missing. "
             f"Delete {directory.parent} to make it anew"
         )
     return concatenate(chunks)
 
 
-def goal_step(last: jax.Array, look_ahead: int) -> tuple[jax.Array, jax.Array]:
-    """Where the intermediate goal o' of each step (Def. 1) lies: `look_ahead` − 1 steps later.
+def goal_step(last: jax.Array, goal_horizon: int) -> tuple[jax.Array, jax.Array]:
+    """Where the intermediate goal o' of each step (Def. 1) lies: `goal_horizon` − 1 steps later.
 
     A step whose episode, or record, ends before that has no such goal. So what led to a fall
-    within the look-ahead is not taken for a way to go anywhere.
+    within the goal horizon is not taken for a way to go anywhere.
 
     Args:
       last: `[T, B]` bool, the last step of an episode.
-      look_ahead: steps, at least 1; 1 is the paper's "next position".
+      goal_horizon: steps, at least 1; 1 is the paper's "next position".
 
     Returns:
       the step `[T, B]` whose outcome is o', and whether there is one, `[T, B]` bool.
@@ -365,5 +365,5 @@ def goal_step(last: jax.Array, look_ahead: int) -> tuple[jax.Array, jax.Array]:
     steps = last.shape[0]
     time = jnp.arange(steps)[:, None]
     end = jax.lax.cummin(jnp.where(last, time, steps - 1), axis=0, reverse=True)
-    goal = time + look_ahead - 1
+    goal = time + goal_horizon - 1
     return jnp.minimum(goal, end), goal <= end

@@ -2,7 +2,7 @@
 
 Everything is written beside its final name and renamed into place once it is on the disk,
 so that a run killed at any moment leaves the old files or the new ones. Directories carry
-the size and crc32 of each file; one that does not match is torn, and is not used. Nothing
+the size and crc32 of each file; one that does not match is corrupt, and is not used. Nothing
 is ever pickled. A full disk, or one that cannot be written, is BadInput everywhere.
 """
 
@@ -33,7 +33,7 @@ import jax
 import numpy as np
 
 from genidm.checks import shown
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.errors import BadInput
 
 MANIFEST = "manifest.json"
@@ -43,7 +43,7 @@ _OLD = f".old.*{_SCRATCH}"
 _ABANDONED = 24 * 3600.0
 
 
-class Torn(BadInput):
+class Corrupt(BadInput):
     """Files that are missing, cut short or changed since they were written."""
 
 
@@ -177,19 +177,19 @@ def save_bytes(path: Path | str, content: bytes) -> None:
 
 
 def save_json(path: Path | str, obj: Any) -> None:
-    """Writes `plain(obj)`."""
-    save_text(path, json.dumps(plain(obj), indent=2) + "\n")
+    """Writes `to_json(obj)`."""
+    save_text(path, json.dumps(to_json(obj), indent=2) + "\n")
 
 
 def load_json(path: Path | str) -> Any:
-    """Reads JSON; raises Torn if the file is missing or is not JSON."""
+    """Reads JSON; raises Corrupt if the file is missing or is not JSON."""
     with disk(path):
         try:
             return json.loads(Path(path).read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise Torn(f"{path} is missing") from None
+            raise Corrupt(f"{path} is missing") from None
         except (ValueError, RecursionError):
-            raise Torn(f"{path} is torn: it is not JSON") from None
+            raise Corrupt(f"{path} is corrupt: it is not JSON") from None
 
 
 def check_writable(path: Path | str, directory: bool = False) -> None:
@@ -272,7 +272,7 @@ def _only_ours(path: Path) -> None:
         return
     try:
         listed = {MANIFEST, *_manifest(path)}
-    except Torn:
+    except Corrupt:
         listed = set()
     for file in sorted(path.rglob("*")):
         name = str(file.relative_to(path))
@@ -281,11 +281,11 @@ def _only_ours(path: Path) -> None:
 
 
 def _manifest(directory: Path) -> dict[str, list[int]]:
-    """Size and crc32 of each file; raises Torn if there is no such list."""
+    """Size and crc32 of each file; raises Corrupt if there is no such list."""
     files = load_json(directory / MANIFEST)
     measures = files.values() if isinstance(files, dict) else [None]
     if not all(isinstance(m, list) and [type(x) for x in m] == [int, int] for m in measures):
-        raise Torn(f"{directory / MANIFEST} is no list of files")
+        raise Corrupt(f"{directory / MANIFEST} is no list of files")
     return files
 
 
@@ -298,25 +298,25 @@ def _measure(file: Path) -> list[int]:
 
 
 def verify(directory: Path | str) -> list[str]:
-    """The files of a complete directory; raises Torn if it is not."""
+    """The files of a complete directory; raises Corrupt if it is not."""
     directory = Path(directory)
     with disk(directory):
         _recover(directory)
         if not directory.exists():
-            raise Torn(f"{directory} is missing")
+            raise Corrupt(f"{directory} is missing")
         files = _manifest(directory)
         for name, measure in files.items():
             if not (directory / name).is_file():
-                raise Torn(f"{directory} is torn: {name} is missing")
+                raise Corrupt(f"{directory} is corrupt: {name} is missing")
             if _measure(directory / name) != measure:
-                raise Torn(f"{directory} is torn: {name} was cut short or changed")
+                raise Corrupt(f"{directory} is corrupt: {name} was cut short or changed")
         return list(files)
 
 
 def _complete(directory: Path) -> bool:
     try:
         return bool(verify(directory))
-    except Torn:
+    except Corrupt:
         return False
 
 
@@ -324,9 +324,9 @@ def save_arrays(path: Path | str, tree: Any, meta: Any, overwrite: bool = False)
     """Writes arrays as a directory of .npy files.
 
     Args:
-      path: the directory; a torn one there is replaced.
+      path: the directory; a corrupt one there is replaced.
       tree: nested dicts of arrays; `{"a": {"b": x}}` becomes `a.b.npy`.
-      meta: what JSON can hold (see `plain`), kept beside them.
+      meta: what JSON can hold (see `to_json`), kept beside them.
       overwrite: replace a complete directory, too.
 
     Raises:
@@ -349,7 +349,7 @@ def load_arrays(path: Path | str, mmap: bool = False) -> tuple[dict[str, Any], A
       mmap: leave the arrays on the disk, read-only, and read what is looked at.
 
     Raises:
-      Torn: a file is missing, cut short or changed.
+      Corrupt: a file is missing, cut short or changed.
       BadInput: a file holds pickled objects.
     """
     path, tree = Path(path), dict[str, Any]()

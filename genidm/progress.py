@@ -26,7 +26,7 @@ METRICS = "metrics.jsonl"
 FLUSH_SECONDS = 5.0
 
 
-def compiled(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
+def compile_ahead(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
     """Compiles a jitted function ahead of its first call, and says how long that took.
 
     One that lies in the compilation cache is only traced anew, and read.
@@ -192,7 +192,7 @@ def read_metrics(path: Path | str) -> list[dict[str, Any]]:
     A last line that was cut short is left out.
 
     Raises:
-      BadInput: the file is missing, or is torn before its last line.
+      BadInput: the file is missing, or is corrupt before its last line.
     """
     with disk(path):
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -202,5 +202,5 @@ def read_metrics(path: Path | str) -> list[dict[str, Any]]:
             metrics.append(json.loads(line))
         except ValueError:
             if number < len(lines):
-                raise BadInput(f"{path} is torn in line {number}") from None
+                raise BadInput(f"{path} is corrupt in line {number}") from None
     return metrics

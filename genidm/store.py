@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from genidm.checkpoints import Checkpoints
-from genidm.config import digest, plain
+from genidm.config import digest, to_json
 from genidm.errors import BadInput
-from genidm.files import Torn, disk, load_json, remove, save_json
+from genidm.files import Corrupt, disk, load_json, remove, save_json
 from genidm.provenance import changed, code_digest, command, environment
 
 T = TypeVar("T")
@@ -77,7 +77,7 @@ class Stage:
 
     def _of_other_code(self, name: str, config: Any, code: Mapping[str, str]) -> Stage | None:
         """The newest finished stage of the same config that other code made."""
-        wanted, found = plain(config), []
+        wanted, found = to_json(config), []
         for path in self.directory.parent.glob(f"{name}-*/{DONE}"):
             other = Stage(path.parent)
             with contextlib.suppress(BadInput, KeyError, TypeError):
@@ -108,17 +108,19 @@ class Stage:
         """Whether the stage is finished."""
         try:
             return isinstance(self.summary(), dict)
-        except Torn:
+        except Corrupt:
             return False
 
     def summary(self) -> Any:
-        """What `finish` was given; raises Torn if the stage is not finished."""
+        """What `finish` was given; raises Corrupt if the stage is not finished."""
         try:
             return load_json(self.path(DONE))
-        except Torn as torn:
-            raise Torn(f"{self.directory} is not the directory of a finished run: {torn}") from None
+        except Corrupt as corrupt:
+            raise Corrupt(
+                f"{self.directory} is not the directory of a finished run: {corrupt}"
+            ) from None
 
-    def once(self, work: Callable[[], dict[str, Any]]) -> None:
+    def run_once(self, work: Callable[[], dict[str, Any]]) -> None:
         """Does the stage, unless it is done; `work` returns its summary.
 
         Where several processes come to one stage, one does it and the others wait. One that
@@ -160,15 +162,15 @@ class Stage:
         """`load(self.path(name), *args)`, of a stage that is finished or goes on.
 
         Raises:
-          Torn: it is torn; the message says which directory to delete, for until then the
+          Corrupt: it is corrupt; the message says which directory to delete, for until then the
             stage stays as it is.
         """
         try:
             return load(self.path(name), *args)
-        except Torn as torn:
-            said = str(torn)
+        except Corrupt as corrupt:
+            said = str(corrupt)
         delete = f"Delete {self.directory} to make it anew"
-        raise Torn(said if delete in said else f"{said}. {delete}")
+        raise Corrupt(said if delete in said else f"{said}. {delete}")
 
     def path(self, name: str) -> Path:
         """Where the stage keeps the file or directory `name`."""
@@ -187,7 +189,7 @@ class Stage:
 def _is_json(path: Path) -> bool:
     try:
         return bool(load_json(path))
-    except Torn:
+    except Corrupt:
         return False
 
 

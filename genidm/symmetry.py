@@ -23,7 +23,7 @@ from genidm.errors import BadInput
 Array = jax.Array
 
 
-def turn_vector(v: Array, yaw: Array) -> Array:
+def rotate_vector(v: Array, yaw: Array) -> Array:
     """Vectors `[..., 3]` turned about the vertical by `yaw [...]`."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
@@ -31,16 +31,16 @@ def turn_vector(v: Array, yaw: Array) -> Array:
     return jnp.stack([ahead, left, jnp.broadcast_to(z, ahead.shape)], axis=-1)
 
 
-def turn_quaternion(q: Array, yaw: Array) -> Array:
+def rotate_quaternion(q: Array, yaw: Array) -> Array:
     """Orientations `[..., 4]` after the world is turned by `yaw [...]`; w ≥ 0."""
     c, s = jnp.cos(yaw / 2), jnp.sin(yaw / 2)
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return positive(
+    return canonical_quaternion(
         jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
     )
 
 
-def positive(q: Array) -> Array:
+def canonical_quaternion(q: Array) -> Array:
     """The one of q and −q, the same orientation, that has w ≥ 0."""
     return jnp.where(q[..., :1] < 0, -q, q)
 
@@ -64,12 +64,12 @@ def euler_of(q: Array) -> Array:
     return jnp.stack([roll, pitch, yaw_of(q)], axis=-1)
 
 
-def horizontal(v: Array) -> Array:
+def horizontal_norm(v: Array) -> Array:
     """Length `[...]` of the horizontal part of vectors `[..., 3]`."""
     return jnp.hypot(v[..., 0], v[..., 1])
 
 
-Turn = Callable[[Array, Array], Array]
+Rotate = Callable[[Array, Array], Array]
 Mirror = Callable[[Array], Array]
 
 
@@ -82,10 +82,10 @@ class Field:
       size: how many there are.
       kind: how they transform, in a word, for the docs.
       unit: SI unit of each number.
-      turn: (x [..., size], yaw [...]) → x after the world is turned by yaw.
+      rotate: (x [..., size], yaw [...]) → x after the world is turned by yaw.
       mirror: x [..., size] → x after the reflection y → −y.
       yaw: x [..., size] → heading [...], for a field that holds one.
-      flaw: x [..., size] on the host → why it cannot be such numbers; None if it can.
+      invalid: x [..., size] on the host → why it cannot be such numbers; None if it can.
       canonical: x [..., size] → the one that stands for it, where several mean the same.
       otherwise: x [..., size] → what x stands for if it was given in another unit or order, None
         if it cannot have been; and the words for that. Of a field with a heading.
@@ -95,10 +95,10 @@ class Field:
     size: int
     kind: str
     unit: str
-    turn: Turn
+    rotate: Rotate
     mirror: Mirror
     yaw: Callable[[Array], Array] | None = None
-    flaw: Callable[[np.ndarray], str | None] | None = None
+    invalid: Callable[[np.ndarray], str | None] | None = None
     canonical: Callable[[Array], Array] | None = None
     otherwise: tuple[Callable[[np.ndarray], np.ndarray | None], str] | None = None
 
@@ -133,12 +133,12 @@ def invariant(name: str, size: int = 1, unit: str = "1") -> Field:
 
 def vector(name: str, unit: str = "m") -> Field:
     """A vector in the world frame (a position, a linear velocity, a force)."""
-    return Field(name, 3, "vector", unit, turn_vector, _signed([1, -1, 1]))
+    return Field(name, 3, "vector", unit, rotate_vector, _signed([1, -1, 1]))
 
 
 def pseudovector(name: str, unit: str = "rad/s") -> Field:
     """A pseudovector in the world frame (an angular velocity)."""
-    return Field(name, 3, "pseudovector", unit, turn_vector, _signed([-1, 1, -1]))
+    return Field(name, 3, "pseudovector", unit, rotate_vector, _signed([-1, 1, -1]))
 
 
 def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
@@ -158,11 +158,11 @@ def quaternion(name: str) -> Field:
         4,
         "quaternion",
         "1",
-        turn_quaternion,
+        rotate_quaternion,
         mirror,
         yaw_of,
         _no_quaternion,
-        positive,
+        canonical_quaternion,
         rolled,
     )
 
@@ -196,12 +196,12 @@ def euler(name: str) -> Field:
     orientation: networks are fed the one in [−π, π).
     """
 
-    def turn(x: Array, yaw: Array) -> Array:
+    def rotate(x: Array, yaw: Array) -> Array:
         return x.at[..., 2].set(wrap(x[..., 2] + yaw))
 
     mirror, yaw = _signed([-1, 1, -1]), lambda x: x[..., 2]
     degrees = (_in_degrees, "where it is read as degrees: the unit is the radian")
-    return Field(name, 3, "Euler angles", "rad", turn, mirror, yaw, _no_euler, wrap, degrees)
+    return Field(name, 3, "Euler angles", "rad", rotate, mirror, yaw, _no_euler, wrap, degrees)
 
 
 def _in_degrees(angles: np.ndarray) -> np.ndarray | None:
@@ -254,14 +254,14 @@ def wrenches(name: str, permutation: Sequence[int]) -> Field:
     count, order = len(permutation), np.asarray(permutation)
     signs = np.asarray([-1, 1, -1, 1, -1, 1], np.float32)
 
-    def turn(x: Array, yaw: Array) -> Array:
+    def rotate(x: Array, yaw: Array) -> Array:
         parts = x.reshape(*x.shape[:-1], 2 * count, 3)
-        return turn_vector(parts, jnp.asarray(yaw)[..., None]).reshape(x.shape)
+        return rotate_vector(parts, jnp.asarray(yaw)[..., None]).reshape(x.shape)
 
     def mirror(x: Array) -> Array:
         return (x.reshape(*x.shape[:-1], count, 6)[..., order, :] * signs).reshape(x.shape)
 
-    return Field(name, 6 * count, "wrenches", "N·m, N", turn, mirror)
+    return Field(name, 6 * count, "wrenches", "N·m, N", rotate, mirror)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,14 +302,14 @@ class Layout:
         """The fields of x `[..., n]` on the host, one after another."""
         return np.split(x, self._edges, axis=-1)
 
-    def flaws(self, x: np.ndarray) -> list[str]:
+    def invalid_fields(self, x: np.ndarray) -> list[str]:
         """What is wrong with x `[..., n]` on the host, a sentence a field: none if it is sound.
 
         Where the first dimension is time, jumps from one row to the next are seen, too.
         """
         parts = zip(self.fields, self.parts(x), strict=True)
-        said = [(f.name, f.flaw(part) if f.flaw else None) for f, part in parts]
-        return [f"{name!r} {flaw}" for name, flaw in said if flaw]
+        said = [(f.name, f.invalid(part) if f.invalid else None) for f, part in parts]
+        return [f"{name!r} {invalid}" for name, invalid in said if invalid]
 
     def canonical(self, x: Array) -> Array:
         """x `[..., n]` with w ≥ 0 in its quaternions and its Euler angles in [−π, π)."""
@@ -318,10 +318,10 @@ class Layout:
         parts = zip(self.fields, self._split(x), strict=True)
         return jnp.concatenate([f.canonical(p) if f.canonical else p for f, p in parts], axis=-1)
 
-    def turn(self, x: Array, yaw: Array) -> Array:
+    def rotate(self, x: Array, yaw: Array) -> Array:
         """x `[..., n]` after the world is turned by `yaw [...]` about the origin's vertical."""
         parts = zip(self.fields, self._split(x), strict=True)
-        return jnp.concatenate([f.turn(part, yaw) for f, part in parts], axis=-1)
+        return jnp.concatenate([f.rotate(part, yaw) for f, part in parts], axis=-1)
 
     def mirror(self, x: Array) -> Array:
         """x `[..., n]` after the reflection y → −y."""

@@ -16,46 +16,46 @@ import jax.numpy as jnp
 
 from genidm.checks import check, count, number, positive
 from genidm.robots.base import Robot, State
-from genidm.symmetry import horizontal
+from genidm.symmetry import horizontal_norm
 
 
-class Lanes(flax.struct.PyTreeNode):
+class EnvState(flax.struct.PyTreeNode):
     """B robots in the middle of their episodes.
 
     Attributes:
       robots: their State.
-      age: `[B]` int32, steps since the episode began.
+      episode_step: `[B]` int32, steps since the episode began.
       keys: `[B]`, one random stream a lane, so that results do not depend on sharding.
       goal: `[B, 3]`, metres, world frame; None where the task has no goals.
     """
 
     robots: State
-    age: jax.Array
+    episode_step: jax.Array
     keys: jax.Array
     goal: Any = None
 
     @property
-    def displacement(self) -> Any:
+    def relative_goal(self) -> Any:
         """From the robots to their goals `[B, 3]`, metres; None where the task has none."""
         return None if self.goal is None else self.goal - self.robots.position
 
 
-class Verdict(NamedTuple):
+class Outcome(NamedTuple):
     """What a task makes of a step, `[...]` each.
 
     Attributes:
       reward: of the step.
       terminal: bool, the episode ends here for good.
-      rest: reward of each step for ever after a terminal one. A robot that has fallen is
-        not let off: what it would be charged if it lay there stands here.
+      absorbing_reward: reward of each step for ever after a terminal one. A robot that has fallen
+        is not let off: what it would be charged if it lay there stands here.
     """
 
     reward: jax.Array
     terminal: jax.Array
-    rest: jax.Array
+    absorbing_reward: jax.Array
 
 
-class Step(flax.struct.PyTreeNode):
+class Transition(flax.struct.PyTreeNode):
     """One transition of B lanes, before any reset; what learners and records read.
 
     Attributes:
@@ -64,8 +64,8 @@ class Step(flax.struct.PyTreeNode):
       after: State `[B]` that it led to.
       goal: `[B, 3]`, metres, world frame; None where the task has no goals.
       reward: `[B]`.
-      rest: `[B]`, see `Verdict`.
-      age: `[B]` int32, steps of the episode before this one.
+      absorbing_reward: `[B]`, see `Outcome`.
+      episode_step: `[B]` int32, steps of the episode before this one.
       terminal: `[B]` bool, the robot fell, arrived, or its physics diverged.
       last: `[B]` bool, the episode ended here: terminal, or at the time limit.
     """
@@ -75,33 +75,35 @@ class Step(flax.struct.PyTreeNode):
     after: State
     goal: Any
     reward: jax.Array
-    rest: jax.Array
-    age: jax.Array
+    absorbing_reward: jax.Array
+    episode_step: jax.Array
     terminal: jax.Array
     last: jax.Array
 
     @property
     def first(self) -> jax.Array:
         """`[B]` bool, `before` is the start of an episode."""
-        return self.age == 0
+        return self.episode_step == 0
 
 
 class Task(Protocol):
     """What an agent learns: settings, as a frozen dataclass.
 
     Attributes:
-      directed: whether there are goals.
+      goal_conditioned: whether there are goals.
     """
 
-    directed: ClassVar[bool]
+    goal_conditioned: ClassVar[bool]
 
-    def start(self, robot: Robot, keys: jax.Array) -> Lanes:
-        """Lanes `[B]` at the start of fresh episodes."""
+    def start(self, robot: Robot, keys: jax.Array) -> EnvState:
+        """EnvState `[B]` at the start of fresh episodes."""
 
-    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
+    def transition(
+        self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
+    ) -> Transition:
         """What a step of every lane under `[B, A]`, which led to `after`, is worth."""
 
-    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+    def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """What is worth a learning curve, `[B]` each."""
 
 
@@ -117,29 +119,31 @@ class WalkForward:
 
     episode_steps: int = 1000
     start_yaw: float = 0.0
-    directed: ClassVar[bool] = False
+    goal_conditioned: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check(self, episode_steps=count(), start_yaw=number(0))
 
-    def start(self, robot: Robot, keys: jax.Array) -> Lanes:
+    def start(self, robot: Robot, keys: jax.Array) -> EnvState:
         robots, streams = _fresh(robot, keys, self.start_yaw)
-        return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams)
+        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams)
 
-    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
-        forward = (after.position[:, 0] - lanes.robots.position[:, 0]) / robot.control_step
+    def transition(
+        self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
+    ) -> Transition:
+        forward = (after.position[:, 0] - lanes.robots.position[:, 0]) / robot.dt
         terminal = after.fallen | after.diverged
-        reward = forward + robot.alive_bonus * ~terminal - robot.cost(after, action)
-        verdict = Verdict(reward, terminal, jnp.zeros_like(reward))
-        return to_step(lanes, action, after, verdict, self.episode_steps)
+        reward = forward + robot.healthy_reward * ~terminal - robot.cost(after, action)
+        outcome = Outcome(reward, terminal, jnp.zeros_like(reward))
+        return to_transition(lanes, action, after, outcome, self.episode_steps)
 
-    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+    def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """Forward speed in m/s, reward, falls, divergences."""
         forward = step.after.position[:, 0] - step.before.position[:, 0]
-        return {"speed": forward / robot.control_step} | _common(step)
+        return {"speed": forward / robot.dt} | _common(step)
 
 
-class Approach(NamedTuple):
+class GoalStep(NamedTuple):
     """A step towards a goal, as far as its reward depends on it, `[...]` each.
 
     Attributes:
@@ -158,16 +162,16 @@ class Approach(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress:
+class ProgressReward:
     """Of VGCP: the robot "is encouraged to move in the direction of the goal" (A.1.1).
 
     The walking reward, with the speed towards the goal in place of the forward speed. Who
     has arrived stands there for ever, so that it is not better to keep away.
     """
 
-    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
-        alive = robot.alive_bonus * ~step.fallen
-        speed = (step.before - step.after) / robot.control_step
+    def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
+        alive = robot.healthy_reward * ~step.fallen
+        speed = (step.before - step.after) / robot.dt
         return speed + alive - step.cost, alive
 
 
@@ -175,7 +179,7 @@ class Progress:
 class Sparse:
     """Of HER-Sparse: "0 if it reaches the goal, and −1 otherwise" (A.1.1)."""
 
-    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
         reward = jnp.where(step.reached, 0.0, -1.0)
         return reward, reward
 
@@ -195,7 +199,7 @@ class Dense:
     def __post_init__(self) -> None:
         check(self, distance=number(0), cost=number(0))
 
-    def __call__(self, robot: Robot, step: Approach) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
         far = jnp.where(step.reached, 0.0, -self.distance * step.after)
         return far - self.cost * step.cost, far
 
@@ -211,21 +215,21 @@ class GoToGoal:
       episode_steps: the time limit.
       start_yaw: radians; starts are turned by a yaw drawn from ± this.
       bearing: radians; goals lie within ± this of the heading.
-      reach: metres; nearer is reached, and ends the episode.
+      goal_radius: metres; nearer is reached, and ends the episode.
     """
 
-    reward: Progress | Sparse | Dense = Progress()
+    reward: ProgressReward | Sparse | Dense = ProgressReward()
     episode_steps: int = 300
     start_yaw: float = math.pi
     bearing: float = math.pi / 4
-    reach: float = 0.1
-    directed: ClassVar[bool] = True
+    goal_radius: float = 0.1
+    goal_conditioned: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         angle = number(0)
-        check(self, episode_steps=count(), start_yaw=angle, bearing=angle, reach=positive())
+        check(self, episode_steps=count(), start_yaw=angle, bearing=angle, goal_radius=positive())
 
-    def start(self, robot: Robot, keys: jax.Array) -> Lanes:
+    def start(self, robot: Robot, keys: jax.Array) -> EnvState:
         robots, streams = _fresh(robot, keys, self.start_yaw)
         streams = jax.vmap(jax.random.split)(streams)
         low, high = robot.target_distance
@@ -238,9 +242,9 @@ class GoToGoal:
 
         distance, bearing = jax.vmap(draw)(streams[:, 0])
         goal = ahead(robot, robots, distance, bearing)
-        return Lanes(robots, jnp.zeros(keys.shape, jnp.int32), streams[:, 1], goal)
+        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams[:, 1], goal)
 
-    def verdict(
+    def outcome(
         self,
         robot: Robot,
         o: jax.Array,
@@ -248,30 +252,32 @@ class GoToGoal:
         goal: jax.Array,
         cost: jax.Array,
         fallen: jax.Array,
-    ) -> Verdict:
+    ) -> Outcome:
         """What a step from `o` to `o_next` `[..., 3]` is worth on the way to `goal`.
 
         A function of what a replay buffer holds, so that a relabelled step is judged as if
         it had been made for its new goal.
         """
-        after = horizontal(goal - o_next)
-        reached = after <= self.reach
-        step = Approach(horizontal(goal - o), after, cost, fallen, reached)
-        reward, rest = self.reward(robot, step)
-        return Verdict(reward, fallen | reached, rest)
+        after = horizontal_norm(goal - o_next)
+        reached = after <= self.goal_radius
+        step = GoalStep(horizontal_norm(goal - o), after, cost, fallen, reached)
+        reward, absorbing_reward = self.reward(robot, step)
+        return Outcome(reward, fallen | reached, absorbing_reward)
 
-    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
-        verdict = self.verdict(
+    def transition(
+        self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
+    ) -> Transition:
+        outcome = self.outcome(
             robot, lanes.robots.position, after.position, lanes.goal,
             robot.cost(after, action), after.fallen | after.diverged,
         )  # fmt: skip
-        return to_step(lanes, action, after, verdict, self.episode_steps)
+        return to_transition(lanes, action, after, outcome, self.episode_steps)
 
-    def metrics(self, robot: Robot, step: Step) -> dict[str, jax.Array]:
+    def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """Speed towards the goal in m/s, arrivals, reward, falls, divergences."""
-        before, after = (horizontal(step.goal - x.position) for x in (step.before, step.after))
-        speed = (before - after) / robot.control_step
-        return {"speed": speed, "reached": 1.0 * (after <= self.reach)} | _common(step)
+        before, after = (horizontal_norm(step.goal - x.position) for x in (step.before, step.after))
+        speed = (before - after) / robot.dt
+        return {"speed": speed, "reached": 1.0 * (after <= self.goal_radius)} | _common(step)
 
 
 def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -> jax.Array:
@@ -296,24 +302,24 @@ def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.
     return robot.reset(streams[:, 1], start_yaw * turn), streams[:, 2]
 
 
-def to_step(
-    lanes: Lanes, action: jax.Array, after: State, verdict: Verdict, episode_steps: int
-) -> Step:
+def to_transition(
+    lanes: EnvState, action: jax.Array, after: State, outcome: Outcome, episode_steps: int
+) -> Transition:
     """The transition of lanes that have stepped, and whether their episodes end with it."""
-    return Step(
+    return Transition(
         before=lanes.robots,
         action=action,
         after=after,
         goal=lanes.goal,
-        reward=verdict.reward,
-        rest=verdict.rest,
-        age=lanes.age,
-        terminal=verdict.terminal,
-        last=verdict.terminal | (lanes.age + 1 >= episode_steps),
+        reward=outcome.reward,
+        absorbing_reward=outcome.absorbing_reward,
+        episode_step=lanes.episode_step,
+        terminal=outcome.terminal,
+        last=outcome.terminal | (lanes.episode_step + 1 >= episode_steps),
     )
 
 
-def _common(step: Step) -> dict[str, jax.Array]:
+def _common(step: Transition) -> dict[str, jax.Array]:
     return {
         "reward": step.reward,
         "falls": 1.0 * step.after.fallen,
@@ -321,16 +327,16 @@ def _common(step: Step) -> dict[str, jax.Array]:
     }
 
 
-def inputs(s: jax.Array, displacement: Any) -> jax.Array:
+def inputs(s: jax.Array, relative_goal: Any) -> jax.Array:
     """What a policy is fed: s `[..., S]`, or (s, g − o) `[..., S + 3]` where there are goals."""
-    return s if displacement is None else jnp.concatenate([s, displacement], axis=-1)
+    return s if relative_goal is None else jnp.concatenate([s, relative_goal], axis=-1)
 
 
 def input_size(robot: Robot, task: Task) -> int:
     """Length of `inputs`."""
-    return robot.observation.size + 3 * task.directed
+    return robot.observation.size + 3 * task.goal_conditioned
 
 
-def outlook(step: Verdict | Step, discount: float) -> jax.Array:
+def bootstrapped_reward(step: Outcome | Transition, discounting: float) -> jax.Array:
     """Reward `[...]` of a step and, if it is terminal, of all that would follow it."""
-    return step.reward + step.terminal * step.rest * discount / (1 - discount)
+    return step.reward + step.terminal * step.absorbing_reward * discounting / (1 - discounting)

@@ -55,7 +55,9 @@ def direct(tmp_path_factory) -> Finished:
 def one_bank(monkeypatch) -> None:
     """Cells share the scenarios that are drawn for them."""
     monkeypatch.setattr(
-        cell_module, "scenarios", lambda robot, *numbers: small_cells.bank(robot.name, *numbers)
+        cell_module,
+        "scenarios",
+        lambda robot, *numbers: small_cells.scenarios(robot.name, *numbers),
     )
 
 

@@ -41,11 +41,11 @@ def step_in_c(
         data.qacc_warmstart = physics.warmstart[lane]
         for action in actions[:, lane]:
             data.ctrl = action
-            mujoco.mj_step(robot.mj_model, data, robot.frames)
+            mujoco.mj_step(robot.mj_model, data, robot.frame_skip)
         mujoco.mj_rnePostConstraint(robot.mj_model, data)
         lanes.append([data.qpos, data.qvel, data.qacc_warmstart, data.cfrc_ext])
         lanes[-1] = [x.copy() for x in lanes[-1]]
-        assert data.time == pytest.approx(len(actions) * robot.control_step)  # not reset on the way
+        assert data.time == pytest.approx(len(actions) * robot.dt)  # not reset on the way
     *after, contact = map(np.stack, zip(*lanes, strict=True))
     return Physics(*after), contact
 
@@ -64,7 +64,7 @@ def assert_close(x: Any, y: Any, **tolerance: float) -> None:
 
 def placed(robot: MujocoRobot, physics: Physics) -> State:
     physics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), physics)
-    return robot.place(physics, jnp.zeros(len(physics.qpos)))
+    return robot.set_state(physics, jnp.zeros(len(physics.qpos)))
 
 
 def assert_commutes(

@@ -45,10 +45,10 @@ class Point(Robot):
     """
 
     name = "point"
-    control_step = 0.05
+    dt = 0.05
     standing_height = 0.5
     target_distance = (2.0, 5.0)
-    alive_bonus = 1.0
+    healthy_reward = 1.0
     paper_interactions = 2048
     control_cost = 0.05
 
@@ -62,7 +62,11 @@ class Point(Robot):
         self.speed, self.frame = speed, frame
         self.falls_at, self.diverges_at = falls_at, diverges_at
         self.settings = dict(
-            name=self.name, speed=speed, frame=frame, falls_at=falls_at, diverges_at=diverges_at
+            name=self.name,
+            speed=speed,
+            input_frame=frame,
+            falls_at=falls_at,
+            diverges_at=diverges_at,
         )
         self.observation = Layout(
             (
@@ -82,7 +86,7 @@ class Point(Robot):
         noise = jax.vmap(lambda key: jax.random.uniform(key, (4,), minval=-1.0))(keys)
         standing = jnp.asarray([[0.0, 0.0, self.standing_height]])
         physics = Physics(standing + 0.1 * noise[:, :3], upright(0.5 * noise[:, 3]))
-        return self.place(physics, yaw)
+        return self.set_state(physics, yaw)
 
     def step(self, state: State, action: jax.Array) -> State:
         action = jnp.clip(action, -1.0, 1.0)
@@ -90,19 +94,17 @@ class Point(Robot):
         velocity = self.speed * jnp.stack([ahead, left, jnp.zeros_like(turn)], axis=-1)
         velocity /= jnp.maximum(jnp.hypot(ahead, left), 1.0)[:, None]
         if self.frame == "own":
-            velocity = symmetry.turn_vector(velocity, state.heading)
-        position = state.position + self.control_step * velocity
-        lost = symmetry.horizontal(position) > self.diverges_at
+            velocity = symmetry.rotate_vector(velocity, state.heading)
+        position = state.position + self.dt * velocity
+        lost = symmetry.horizontal_norm(position) > self.diverges_at
         position = jnp.where(lost[:, None], jnp.nan, position)
-        turned = symmetry.turn_quaternion(
-            state.physics.orientation, self.control_step * TURN_RATE * turn
-        )
+        turned = symmetry.rotate_quaternion(state.physics.orientation, self.dt * TURN_RATE * turn)
         wheels = jnp.stack([ahead - turn, ahead + turn], axis=-1)
         after = self._state(Physics(position, turned), velocity, wheels)
         return select(lost, state.replace(diverged=lost), after)
 
-    def place(self, physics: Physics, yaw: jax.Array) -> State:
-        turned = self.turn_physics(physics, yaw)
+    def set_state(self, physics: Physics, yaw: jax.Array) -> State:
+        turned = self.rotate_physics(physics, yaw)
         still = jnp.zeros_like(turned.position)
         state = self._state(turned, still, still[:, :2])
         return state.replace(fallen=jnp.zeros_like(state.fallen))
@@ -112,7 +114,7 @@ class Point(Robot):
 
     def _state(self, physics: Physics, velocity: jax.Array, wheels: jax.Array) -> State:
         height = physics.position[:, 2:]
-        fallen = symmetry.horizontal(physics.position) > self.falls_at
+        fallen = symmetry.horizontal_norm(physics.position) > self.falls_at
         return State(
             physics=physics,
             observation=jnp.concatenate([height, physics.orientation, velocity, wheels], axis=-1),
@@ -126,7 +128,9 @@ class Point(Robot):
 def upright(yaw: jax.Array) -> jax.Array:
     """Orientations `[B, 4]` of headings `[B]`."""
     zero = jnp.zeros_like(yaw)
-    return symmetry.positive(jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)], axis=-1))
+    return symmetry.canonical_quaternion(
+        jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)], axis=-1)
+    )
 
 
 class Straight(flax.struct.PyTreeNode):
@@ -140,7 +144,7 @@ class Straight(flax.struct.PyTreeNode):
     pace: jax.Array
     robot: Point = flax.struct.field(pytree_node=False)
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        level = direction(displacement * jnp.asarray([[1.0, 1.0, 0.0]]))
-        ahead = symmetry.turn_vector(level, -self.robot.observation.yaw(s))
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        level = direction(relative_goal * jnp.asarray([[1.0, 1.0, 0.0]]))
+        ahead = symmetry.rotate_vector(level, -self.robot.observation.yaw(s))
         return (self.pace * ahead).at[:, 2].set(0.3)

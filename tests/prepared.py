@@ -16,7 +16,7 @@ class Prepared:
     """An agent whose programs are compiled once for each robot, task and mesh."""
 
     def __init__(self, agent: Agent):
-        self.agent, self.lanes, self.unroll = agent, agent.lanes, agent.unroll
+        self.agent, self.num_envs, self.unroll_length = agent, agent.num_envs, agent.unroll_length
 
     @functools.cache  # noqa: B019  what it keeps alive, the programs, is what it is for
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:

@@ -17,19 +17,19 @@ from tiny import TEST, tiny
 
 from genidm.evaluation.scenarios import Scenarios, scenarios
 from genidm.paper import methods
-from genidm.paper.methods import Inverse, Method
+from genidm.paper.methods import InverseDynamics, Method
 from genidm.runs import command as command_module
 from genidm.runs import run as run_module
-from genidm.runs.cell import cell, run_cell
+from genidm.runs.cell import make_run, run_method
 from genidm.runs.resolve import Options
 
 
-def small(method: Inverse) -> Inverse:
+def small(method: InverseDynamics) -> InverseDynamics:
     """Tiny, with updates enough to be killed among."""
     fit = dataclasses.replace(
         tiny(method).fit, updates=2500, latent_size=method.fit.latent_size and 2
     )
-    return tiny(method, look_ahead=10, fit=fit)
+    return tiny(method, goal_horizon=10, fit=fit)
 
 
 RS, GE, LR = (small(m) for m in (methods.RS, methods.GE, methods.LR))
@@ -37,7 +37,7 @@ VGCP, HER_SP = (tiny(m) for m in (methods.VGCP, methods.HER_SP))
 
 
 def options(out: Path, **changes) -> Options:
-    return dataclasses.replace(Options(scale="0.5", out=out, episodes=2, test=TEST), **changes)
+    return dataclasses.replace(Options(scale="0.5", run_dir=out, episodes=2, test=TEST), **changes)
 
 
 STAGES = ("collect", "replay", "fit", "run")
@@ -80,15 +80,15 @@ def finish(out: Path, *of: Method) -> Finished:
     for method in of:
         with counted() as calls:
             if method is of[-1]:
-                report = run_cell(Point(), method, options(out))
+                report = run_method(Point(), method, options(out))
             else:
-                cell(Point(), method, options(out)).episodes(bank("point", 10, 2))
+                make_run(Point(), method, options(out)).run_test(tested_scenarios("point", 10, 2))
         done.append(calls)
     return Finished(out, report, done)
 
 
 @functools.cache
-def bank(name: str, *numbers: int) -> Scenarios:
+def tested_scenarios(name: str, *numbers: int) -> Scenarios:
     """Scenarios are drawn once for all cells: they see the robot and two numbers alone."""
     return scenarios(Point(), *numbers)
 
@@ -108,8 +108,8 @@ def stage_of(out: Path, name: str) -> Path:
 
 def command(out: Path, *flags: str, robot: type[Point] = Point, method: Method = LR) -> None:
     """The command line of a cell, at the scale of these tests."""
-    test = ("--test.max-steps", "40", "--test.lanes", "16", "--test.chunk", "10")
-    start = ("cell", "--scale", "0.5", "--episodes", "2", "--out", str(out), *test)
+    test = ("--test.max-steps", "40", "--test.num-envs", "16", "--test.chunk", "10")
+    start = ("cell", "--scale", "0.5", "--episodes", "2", "--run-dir", str(out), *test)
     with pytest.MonkeyPatch.context() as m:
         m.setattr(sys, "argv", [*start, *flags])
         command_module.main(robot, method)

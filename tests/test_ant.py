@@ -18,7 +18,7 @@ from genidm import symmetry
 from genidm.engines import Physics
 from genidm.robots import Ant, State
 from genidm.robots.mujoco import mirror_of
-from genidm.tasks import Lanes, Step, WalkForward
+from genidm.tasks import EnvState, Transition, WalkForward
 
 LANES = 32
 
@@ -89,7 +89,7 @@ def test_next_state_is_that_of_c(starts: Physics, one_step: tuple[Any, ...]) -> 
     actions, after, contact = one_step
     with jax.enable_x64(True):
         robot = Ant()
-        state = jax.jit(robot.step)(robot.place(starts, jnp.zeros(LANES)), jnp.asarray(actions))
+        state = jax.jit(robot.step)(robot.set_state(starts, jnp.zeros(LANES)), jnp.asarray(actions))
         assert state.physics.qpos.dtype == jnp.float64
         got, observation = positive_w(state.physics), np.asarray(state.observation)
     expected = observed_in_c(after, contact)
@@ -134,7 +134,7 @@ def episode(starts: Physics, ant: Ant) -> tuple[Any, ...]:
 
 def test_yaw_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
     yaw = np.linspace(-np.pi, np.pi, LANES)
-    assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.turn(x, yaw))
+    assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.rotate(x, yaw))
 
 
 def test_mirror_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[Any, ...]) -> None:
@@ -194,17 +194,17 @@ def test_a_reset_costs_no_physics(ant: Ant) -> None:
 def test_resets_are_turned(robot: Ant) -> None:
     yaw = jnp.linspace(-3.0, 3.0, LANES)
     straight, turned = robot.reset(keys(0), jnp.zeros(LANES)), robot.reset(keys(0), yaw)
-    assert_close(turned.observation, robot.observation.turn(straight.observation, yaw), atol=1e-6)
-    assert_close(turned.position, symmetry.turn_vector(straight.position, yaw), atol=1e-6)
+    assert_close(turned.observation, robot.observation.rotate(straight.observation, yaw), atol=1e-6)
+    assert_close(turned.position, symmetry.rotate_vector(straight.position, yaw), atol=1e-6)
     assert_close(symmetry.wrap(turned.heading - straight.heading - yaw), 0.0, atol=1e-5)
 
 
 def test_placing_turns_the_record(robot: Ant, starts: Physics) -> None:
     yaw, record = jnp.linspace(-3.0, 3.0, LANES), placed(robot, starts)
-    state = robot.place(record.physics, yaw)
-    assert_close(state.physics, robot.turn_physics(record.physics, yaw), atol=0)
-    assert_close(state.observation, robot.observation.turn(record.observation, yaw), atol=1e-6)
-    assert_close(state.position, symmetry.turn_vector(record.position, yaw), atol=1e-6)
+    state = robot.set_state(record.physics, yaw)
+    assert_close(state.physics, robot.rotate_physics(record.physics, yaw), atol=0)
+    assert_close(state.observation, robot.observation.rotate(record.observation, yaw), atol=1e-6)
+    assert_close(state.position, symmetry.rotate_vector(record.position, yaw), atol=1e-6)
     assert not state.fallen.any() and not state.diverged.any()
 
 
@@ -248,7 +248,7 @@ def test_layouts_have_the_papers_sizes(ant: Ant) -> None:
     assert ant.observation.size == 111
     assert jax.tree.map(lambda layout: layout.size, ant.physics) == Physics(15, 14, 14)
     assert ant.action.size == 8
-    assert ant.control_step == pytest.approx(ant.frames * ant.mj_model.opt.timestep)
+    assert ant.dt == pytest.approx(ant.frame_skip * ant.mj_model.opt.timestep)
 
 
 def test_layouts_describe_themselves(ant: Ant) -> None:
@@ -288,7 +288,9 @@ def test_numbers_stand_where_gymnasium_has_them(
 # ── (e) fresh starts inside a task ──────────────────────────────────────────────────────────
 
 
-def walk(robot: Ant, task: WalkForward, lanes: Lanes, steps: int) -> tuple[Lanes, list[Step]]:
+def walk(
+    robot: Ant, task: WalkForward, lanes: EnvState, steps: int
+) -> tuple[EnvState, list[Transition]]:
     made = []
     for t in range(steps):
         lanes, step = advance(task, robot, lanes, actions_of(t))
@@ -304,7 +306,7 @@ def test_lanes_that_end_start_afresh(robot: Ant) -> None:
     for t, step in enumerate(steps):
         assert (step.first == (t % 2 == 0)).all()
         assert (step.last == (t % 2 == 1)).all()
-    assert (lanes.age == 1).all()
+    assert (lanes.episode_step == 1).all()
     starts = jnp.concatenate([steps[t].before.physics.qpos for t in (0, 2, 4)])
     assert distances(starts).min() > 0.01  # other lanes' and other episodes'
     assert np.std(np.concatenate([steps[t].before.heading for t in (0, 2, 4)])) > 0.3
@@ -314,7 +316,7 @@ def test_lanes_that_end_start_afresh(robot: Ant) -> None:
 
 def test_falls_and_divergence_end_an_episode(robot: Ant) -> None:
     task = WalkForward(episode_steps=1000)
-    lanes = task.start(robot, keys(0)).replace(age=jnp.full(LANES, 7, jnp.int32))
+    lanes = task.start(robot, keys(0)).replace(episode_step=jnp.full(LANES, 7, jnp.int32))
     robots = broken(lanes.robots)
     high = robots.physics.qpos.at[9, 2].set(5.0)
     robots = robots.replace(physics=robots.physics.replace(qpos=high))
@@ -323,7 +325,7 @@ def test_falls_and_divergence_end_an_episode(robot: Ant) -> None:
     assert np.flatnonzero(step.terminal).tolist() == ended
     assert np.flatnonzero(step.last).tolist() == ended
     assert not step.first.any()
-    assert np.array_equal(after.age, np.where(step.last, 0, 8))
+    assert np.array_equal(after.episode_step, np.where(step.last, 0, 8))
     assert_finite((after, step.reward, step.after))
     assert np.abs(step.reward).max() < 1e3
     fresh = after.robots.physics.qpos[jnp.array(ended)]

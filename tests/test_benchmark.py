@@ -41,7 +41,11 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(fitting, "UPDATES", 2)
     monkeypatch.setattr(fitting, "SAMPLES", 600)
     return Options(
-        out=tmp_path / "out" / "benchmark.json", seconds=1e-3, lanes=8, wide=16, bank=(1, 20)
+        out=tmp_path / "out" / "benchmark.json",
+        seconds=1e-3,
+        num_envs=8,
+        wide=16,
+        scenarios=(1, 20),
     )
 
 
@@ -107,7 +111,7 @@ def test_mujoco_batch_steps_the_robots_own_model(ant, small):
 
     class Batch(stepping.Batch):
         def __init__(self, model, count, nthread):
-            assert (model, count, nthread) == (ant.mj_model, small.lanes, 1)
+            assert (model, count, nthread) == (ant.mj_model, small.num_envs, 1)
             super().__init__(model, count, nthread)
             made.append(self)
 
@@ -117,7 +121,7 @@ def test_mujoco_batch_steps_the_robots_own_model(ant, small):
         probe = stepping.batch(Bench(ant, small, exits), threads=1)
         assert probe.sample(0.0) > 0
     calls = 2  # once to warm up, once timed
-    np.testing.assert_allclose(made[0].time, calls * stepping.STEPS * ant.control_step)
+    np.testing.assert_allclose(made[0].time, calls * stepping.STEPS * ant.dt)
     assert made[0].ctrl.any() and probe.note == "8 lanes, 1 thread"
 
 
@@ -229,7 +233,7 @@ def test_compiling_counts():
     ("arguments", "said"),
     [
         (["--rows", "nothing"], "no row is called 'nothing'"),
-        (["--lanes", "7"], "7 lanes cannot be shared among 2 devices"),
+        (["--num-envs", "7"], "7 lanes cannot be shared among 2 devices"),
         (["--seconds", "-1"], "seconds must be a number above 0"),
         (["--out", "."], "is a directory"),
         (["--run", "nowhere"], "nowhere"),

@@ -13,11 +13,11 @@ import pytest
 from genidm.agents.buffer import (
     Buffer,
     Index,
-    Memory,
-    draw,
+    ReplayTransition,
+    add,
     empty,
-    insert,
-    look_up,
+    gather,
+    sample_index,
     steps_left,
 )
 from genidm.errors import BadInput
@@ -25,8 +25,8 @@ from genidm.errors import BadInput
 ROWS, LANES, UNROLL = 12, 5, 3
 DRAWN = 20_000
 
-jitted = {f: jax.jit(f) for f in (insert, steps_left, look_up)}
-jitted[draw] = jax.jit(draw, static_argnums=2)
+jitted = {f: jax.jit(f) for f in (add, steps_left, gather)}
+jitted[sample_index] = jax.jit(sample_index, static_argnums=2)
 
 
 class Told(NamedTuple):
@@ -34,21 +34,21 @@ class Told(NamedTuple):
 
     n: int
     lane: int
-    age: int
+    episode_step: int
     last: bool
 
 
 def story(rows: int) -> list[list[Told]]:
     """Rows of lanes: short episodes, longer ones, and in lane 0 one that never ends."""
-    rng, age, told = np.random.default_rng(0), [0] * LANES, []
+    rng, episode_step, told = np.random.default_rng(0), [0] * LANES, []
     for n in range(rows):
         lasts = [lane > 0 and rng.random() < 0.9 / (2 * lane) for lane in range(LANES)]
-        told.append([Told(n, lane, age[lane], last) for lane, last in enumerate(lasts)])
-        age = [0 if last else a + 1 for a, last in zip(age, lasts, strict=True)]
+        told.append([Told(n, lane, episode_step[lane], last) for lane, last in enumerate(lasts)])
+        episode_step = [0 if last else a + 1 for a, last in zip(episode_step, lasts, strict=True)]
     return told
 
 
-def memory(told: list[list[Told]]) -> Memory:
+def memory(told: list[list[Told]]) -> ReplayTransition:
     """Every number of a step says which it is."""
 
     def of(what: str) -> np.ndarray:
@@ -56,11 +56,11 @@ def memory(told: list[list[Told]]) -> Memory:
 
     number = np.float32(1 + of("n") * LANES + of("lane"))
     vector = number[..., None] + np.float32([0.0, 0.25, 0.5])
-    last, age = of("last"), of("age").astype(np.int32)
-    return Memory(
+    last, episode_step = of("last"), of("episode_step").astype(np.int32)
+    return ReplayTransition(
         s=vector[..., :2], o=vector, o_next=vector + 1000, a=vector[..., :1], goal=-vector,
-        cost=number, fallen=last, reward=-number, rest=number / 2, terminal=last,
-        last=last, age=age,
+        cost=number, fallen=last, reward=-number, absorbing_reward=number / 2, terminal=last,
+        last=last, episode_step=episode_step,
     )  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def filled(parts: int) -> tuple[Buffer, list[list[Told]]]:
         part = jax.eval_shape(lambda: memory(story(UNROLL)))
         return empty(part, ROWS * LANES + UNROLL * LANES - 1), told
     buffer, _ = filled(parts - 1)
-    return jitted[insert](buffer, memory(told[-UNROLL:])), told
+    return jitted[add](buffer, memory(told[-UNROLL:])), told
 
 
 def kept(told: list[list[Told]]) -> list[list[Told]]:
@@ -109,7 +109,7 @@ def test_steps_left_are_those_of_the_story(parts: int) -> None:
 @pytest.mark.parametrize("parts", PARTS)
 def test_every_step_but_the_newest_is_drawn_as_often_as_any(parts: int) -> None:
     buffer, told = filled(parts)
-    at = jitted[draw](buffer, jax.random.key(parts), DRAWN)
+    at = jitted[sample_index](buffer, jax.random.key(parts), DRAWN)
     counts = np.zeros((ROWS, LANES), int)
     np.add.at(counts, (np.asarray(at.row), np.asarray(at.lane)), 1)
     drawable = [row[0].n % ROWS for row in kept(told)[:-1]]
@@ -123,29 +123,31 @@ def test_what_is_looked_up_is_the_step_and_the_state_after_it(parts: int) -> Non
     buffer, told = filled(parts)
     steps = [t for row in kept(told)[:-1] for t in row]
     at = Index(jnp.array([t.n % ROWS for t in steps]), jnp.array([t.lane for t in steps]))
-    rows, s_next = jitted[look_up](buffer, at)
+    rows, s_next = jitted[gather](buffer, at)
     jax.tree.map(np.testing.assert_array_equal, rows, listed(steps))
     after = [told[t.n + 1][t.lane] for t in steps]
     np.testing.assert_array_equal(s_next, listed(after).s)
     goes_on = ~rows.last
-    np.testing.assert_array_equal(listed(after).age, jnp.where(goes_on, rows.age + 1, 0))
+    np.testing.assert_array_equal(
+        listed(after).episode_step, jnp.where(goes_on, rows.episode_step + 1, 0)
+    )
 
 
-def listed(steps: list[Told]) -> Memory:
+def listed(steps: list[Told]) -> ReplayTransition:
     return jax.tree.map(lambda x: x[:, 0], memory([[t] for t in steps]))
 
 
 def test_the_story_has_what_these_tests_need() -> None:
     told = story(PARTS[-1] * UNROLL)
     assert not any(row[0].last for row in told) and len(told) > 3 * ROWS
-    lengths = [t.age + 1 for row in told for t in row if t.last]
+    lengths = [t.episode_step + 1 for row in told for t in row if t.last]
     assert min(lengths) == 1 and max(lengths) > ROWS / 2
 
 
 def test_a_buffer_is_made_of_whole_parts_and_no_fewer_than_two() -> None:
     part = jax.eval_shape(lambda: memory(story(UNROLL)))
-    for capacity in (2 * UNROLL * LANES, 3 * UNROLL * LANES - 1):
-        assert empty(part, capacity).rows.s.shape == (2 * UNROLL, LANES, 2)
-    for capacity in (2 * UNROLL * LANES - 1, 0, -5):
+    for max_replay_size in (2 * UNROLL * LANES, 3 * UNROLL * LANES - 1):
+        assert empty(part, max_replay_size).rows.s.shape == (2 * UNROLL, LANES, 2)
+    for max_replay_size in (2 * UNROLL * LANES - 1, 0, -5):
         with pytest.raises(BadInput, match="holds no two"):
-            empty(part, capacity)
+            empty(part, max_replay_size)

@@ -23,7 +23,7 @@ from genidm.paper.generalize import Generalize
 from genidm.progress import METRICS, read_metrics
 from genidm.provenance import code_digest
 from genidm.runs import run as run_module
-from genidm.runs.cell import cell, run_cell
+from genidm.runs.cell import make_run, run_method
 from genidm.store import Stage
 from genidm.tasks import WalkForward
 
@@ -55,9 +55,9 @@ def test_the_report_is_there(finished: Finished) -> None:
 
 def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:
     results = finished.results
-    bank = scenarios(Point(), 10, 2)
+    tested_scenarios = scenarios(Point(), 10, 2)
     assert (results["robot"], results["scale"]) == ("point", "0.5")
-    assert results["scenarios"] == bank.digest()
+    assert results["scenarios"] == tested_scenarios.digest()
     assert list(results["methods"]) == ["RS", "GE", "LR"]
     lr = results["methods"]["LR"]
     keys = {"interactions", "replayed", "seeds", "episodes", "mean", "std", "ci95", "iqm"}
@@ -65,7 +65,7 @@ def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:
     assert (lr["interactions"], lr["replayed"]) == (1024, 512)
     assert (results["methods"]["RS"]["replayed"], lr["seeds"], lr["episodes"]) == (0, 10, 2)
     assert list(lr["success"]) == ["0.25", "0.5", "1.0"]
-    assert lr["settings"]["fit"]["latent_size"] == 2 and lr["settings"]["look_ahead"] == 10
+    assert lr["settings"]["fit"]["latent_size"] == 2 and lr["settings"]["goal_horizon"] == 10
     assert results["paired"].keys() == {"GE-RS", "LR-GE", "LR-RS"}
 
 
@@ -98,7 +98,7 @@ def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> N
     row = finished.results["methods"]["LR"]
     for name in ("mean", "std", "iqm", "fell", "ci95"):
         assert row[name] == pytest.approx(summary[name], abs=1e-6)
-    assert len(tree["ways"]) == 20
+    assert len(tree["trajectories"]) == 20
     # A target lies 2 to 5 m away; no episode of 40 steps at 1 m/s comes nearer than it walks.
     assert (episodes.start >= 2).all() and (episodes.start <= 5).all()
     assert (episodes.path_length <= 2 + 1e-4).all() and (episodes.path_length > 0).all()
@@ -112,7 +112,7 @@ def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Pa
     names, results = files(copy).keys(), "point/report-0.5/results.json"
     was = (copy / results).read_bytes()
     with counted() as calls:
-        command(copy, "--results", str(tmp_path / "results"))
+        command(copy, "--report-dir", str(tmp_path / "results"))
     assert not calls and files(copy).keys() == names
     assert {p: p.stat().st_mtime_ns for p in copy.rglob("*") if "report" not in str(p)} == before
     table = (copy / "point" / "report-0.5" / "table.txt").read_text()
@@ -137,7 +137,7 @@ def test_what_is_no_summary_spoils_no_report(copy: Path, capsys, content: str) -
     ("changes", "again"),
     [
         (dict(fit=dataclasses.replace(LR.fit, latent_size=3)), {"fit", "run"}),
-        (dict(look_ahead=3), {"fit", "run"}),
+        (dict(goal_horizon=3), {"fit", "run"}),
         (dict(generalize=Generalize(segment=3)), {"replay", "fit", "run"}),
         (dict(task=WalkForward(19)), {"collect", "replay", "fit", "run"}),
     ],
@@ -146,7 +146,7 @@ def test_one_change_runs_what_depends_on_it_again(
     copy: Path, monkeypatch, changes: dict, again: set
 ) -> None:
     """Which of the stages are to be made is all that is looked at: none is made."""
-    this = cell(Point(), dataclasses.replace(LR, **changes), options(copy))
+    this = make_run(Point(), dataclasses.replace(LR, **changes), options(copy))
     made = {
         "collect": this.experience_stage.done,
         "replay": this.replay_stage.done,
@@ -156,12 +156,12 @@ def test_one_change_runs_what_depends_on_it_again(
 
 
 def test_another_seed_and_another_test_have_stages_of_their_own(copy: Path, monkeypatch) -> None:
-    seed = cell(Point(), LR, options(copy, seed=1))
+    seed = make_run(Point(), LR, options(copy, seed=1))
     assert not (seed.experience_stage.done or seed.replay_stage.done or seed.controller_stage.done)
     monkeypatch.setattr(run_module, "run", ran)
-    for changes in (dict(episodes=1), dict(test=dataclasses.replace(TEST, reach=0.2))):
+    for changes in (dict(episodes=1), dict(test=dataclasses.replace(TEST, goal_radius=0.2))):
         with counted() as calls, pytest.raises(Ran):
-            run_cell(Point(), LR, options(copy, **changes))
+            run_method(Point(), LR, options(copy, **changes))
         assert calls == Counter(run=1)
 
 
@@ -182,7 +182,7 @@ def test_a_policy_is_its_own_controller(direct: Finished) -> None:
     assert stages == {"VGCP-0", "test-VGCP-0"}
     stage = Stage(stage_of(direct.out, "VGCP"))
     policy = controller.load(stage.path("controller"), Point())
-    assert isinstance(policy, Policy) and policy.directed
+    assert isinstance(policy, Policy) and policy.goal_conditioned
     assert not any(stage.path(x).exists() for x in ("experience", "checkpoints"))
     lines = read_metrics(stage.path(METRICS))
     assert lines[-1]["step"] == stage.summary()["learned_from"] == 1024
@@ -193,7 +193,7 @@ def test_its_row_stands_among_the_others(direct: Finished, copy: Path) -> None:
     for stage in (direct.out / "point").glob("*VGCP-0-*"):
         shutil.copytree(stage, copy / "point" / stage.name)
     with counted() as calls:
-        report = run_cell(Point(), VGCP, options(copy))
+        report = run_method(Point(), VGCP, options(copy))
     assert not calls
     results = json.loads((report / "results.json").read_text())["methods"]
     assert list(results) == ["RS", "VGCP", "GE", "LR"]

@@ -144,7 +144,7 @@ def files_of(directory: Path) -> list[str]:
     return [str(p) for p in found]
 
 
-def test_torn_checkpoints_give_way_to_the_one_before(tmp_path: Path, capfd) -> None:
+def test_corrupt_checkpoints_give_way_to_the_one_before(tmp_path: Path, capfd) -> None:
     like = {"a": np.zeros(50)}
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, {"a": np.full(50, 1.0)})

@@ -17,18 +17,32 @@ from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
 from genidm.checks import count, layers, number, optional, positive
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test
-from genidm.evaluation.waypoints import Follow
+from genidm.evaluation.evaluate import EvaluationSettings
+from genidm.evaluation.waypoints import WaypointSettings
 from genidm.paper.fit import Fit
 from genidm.paper.generalize import Generalize
 from genidm.paper.methods import LR, VGCP
 from genidm.tasks import Dense, GoToGoal, WalkForward
-from genidm.video import Shot
+from genidm.video import RenderSettings
 
 SETTINGS = [
-    PPO(), SAC(), DDPG(), HER(), RandomActions(), Frozen(PPO(), 0.5), Fit(), Test(), Generalize(),
-    Follow(), WalkForward(), GoToGoal(), Dense(), Shot(), LR, VGCP,
-]  # fmt: skip
+    PPO(),
+    SAC(),
+    DDPG(),
+    HER(),
+    RandomActions(),
+    Frozen(PPO(), 0.5),
+    Fit(),
+    EvaluationSettings(),
+    Generalize(),
+    WaypointSettings(),
+    WalkForward(),
+    GoToGoal(),
+    Dense(),
+    RenderSettings(),
+    LR,
+    VGCP,
+]
 
 
 def numbers(settings: Any) -> list[str]:
@@ -59,11 +73,18 @@ def test_every_number_has_a_range(settings: Any, name: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "name", "wrong"),
     [
-        (PPO(), "discount", 1.5), (PPO(), "discount", 1.0), (PPO(), "gae", 7), (PPO(), "clip", 0),
-        (PPO(), "max_gradient", 0), (SAC(), "tau", 1.1), (Fit(), "latent_weight", 1.0),
-        (LR, "share", 1.2), (Shot(), "fps", 0), (Follow(), "reach", 0),
+        (PPO(), "discounting", 1.5),
+        (PPO(), "discounting", 1.0),
+        (PPO(), "gae_lambda", 7),
+        (PPO(), "clipping_epsilon", 0),
+        (PPO(), "max_grad_norm", 0),
+        (SAC(), "tau", 1.1),
+        (Fit(), "latent_loss_weight", 1.0),
+        (LR, "fraction", 1.2),
+        (RenderSettings(), "fps", 0),
+        (WaypointSettings(), "goal_radius", 0),
     ],
-)  # fmt: skip
+)
 def test_ends_of_ranges(settings: Any, name: str, wrong: float) -> None:
     with pytest.raises(BadInput, match=name):
         dataclasses.replace(settings, **{name: wrong})
@@ -72,9 +93,14 @@ def test_ends_of_ranges(settings: Any, name: str, wrong: float) -> None:
 @pytest.mark.parametrize("wrong", [(0,), (-1,), (64, 0), (64, 10**9), (1.5,), 64, ("64",)])
 @pytest.mark.parametrize(
     ("settings", "name"),
-    [(PPO(), "hidden"), (PPO(), "value_hidden"), (SAC(), "critic_hidden"), (Fit(), "idm"),
-     (Fit(), "lfm")],
-)  # fmt: skip
+    [
+        (PPO(), "policy_hidden_layer_sizes"),
+        (PPO(), "value_hidden_layer_sizes"),
+        (SAC(), "critic_hidden_layer_sizes"),
+        (Fit(), "idm"),
+        (Fit(), "lfm"),
+    ],
+)
 def test_widths_of_layers(settings: Any, name: str, wrong: Any) -> None:
     with pytest.raises(BadInput, match=name):
         dataclasses.replace(settings, **{name: wrong})

@@ -19,14 +19,14 @@ from tiny import TEST
 from experiments import evaluate, walk, waypoints
 from genidm import controller
 from genidm.errors import BadInput
-from genidm.evaluation.waypoints import Follow
+from genidm.evaluation.waypoints import WaypointSettings
 from genidm.files import load_arrays, save_arrays
 from genidm.paper import methods
-from genidm.paper.methods import literal
+from genidm.paper.methods import paper_settings
 from genidm.robots import ROBOTS, Ant, Humanoid, Minitaur, Robot
 from genidm.runs import command as command_module
 from genidm.runs import run as run_module
-from genidm.runs.cell import cell
+from genidm.runs.cell import make_run
 from genidm.runs.resolve import Options
 from genidm.runs.scale import Scale, scale_of
 from genidm.store import MADE, Stage
@@ -38,27 +38,34 @@ pytestmark = pytest.mark.usefixtures("one_bank")
 # ── what is run: scale, literal, what the user sets ──────────────────────────────────────
 
 
-def test_the_literal_method_is_the_papers() -> None:
-    this = cell(Point(), LR, Options(literal=True)).method
-    assert this == literal(LR) and this.name == "LR literal" and this.look_ahead == 1
-    kept = (this.generalize.mode, this.fit.latent_weight, this.fit.averaged, this.fit.decay)
+def test_the_method_with_paper_settings_is_the_papers() -> None:
+    this = make_run(Point(), LR, Options(paper_settings=True)).method
+    assert this == paper_settings(LR) and this.name == "LR paper" and this.goal_horizon == 1
+    kept = (
+        this.generalize.mode,
+        this.fit.latent_loss_weight,
+        this.fit.mean_latent,
+        this.fit.cosine_decay,
+    )
     assert kept == ("episodes", 0.25, True, False)
     with pytest.raises(BadInput, match="letter"):
-        cell(Point(), methods.VGCP, Options(literal=True))
+        make_run(Point(), methods.VGCP, Options(paper_settings=True))
 
 
 def test_scales_are_shares_of_the_paper() -> None:
     assert scale_of("paper", 2000) == Scale("paper", 2000, 1.0, 10, 1000)
-    assert scale_of("0.1", 2000) == Scale("0.1", 200, 0.1, 10, 100, look_ahead=50, learning=2 / 3)
+    assert scale_of("0.1", 2000) == Scale("0.1", 200, 0.1, 10, 100, goal_horizon=50, learning=2 / 3)
     million = scale_of("0.5", 2_000_000)
     assert million == Scale("0.5", 1_000_000, 0.5, 10, 500, learning=2 / 3)
     assert scale_of("2", 2_000_000) == Scale("2", 4_000_000, 1.0, 10, 1000)
     quick = scale_of("quick", 2_000_000)
-    assert quick.interactions < 500_000 and quick.updates < 0.5 and quick.look_ahead < 100
-    this = cell(Point(), dataclasses.replace(LR, look_ahead=999), Options(scale="quick"))
-    assert this.method.look_ahead == quick.look_ahead
-    assert this.method.share == quick.share == 1.0
-    given = {name: cell(Point(), methods.LR, Options(scale=name)) for name in ("quick", "paper")}
+    assert quick.interactions < 500_000 and quick.updates < 0.5 and quick.goal_horizon < 100
+    this = make_run(Point(), dataclasses.replace(LR, goal_horizon=999), Options(scale="quick"))
+    assert this.method.goal_horizon == quick.goal_horizon
+    assert this.method.fraction == quick.fraction == 1.0
+    given = {
+        name: make_run(Point(), methods.LR, Options(scale=name)) for name in ("quick", "paper")
+    }
     assert given["quick"].method.agent == quick.ppo != methods.LR.agent
     assert given["paper"].method.agent == methods.LR.agent
     assert this.method.agent == LR.agent  # what a user has set stands
@@ -76,10 +83,10 @@ def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
     ("flags", "name", "value"),
     [
         # Each equals a default, or stands beside what would choose another.
-        (("--scale", "quick", "--method.agent.discount", "0.99"), "agent.discount", 0.99),
-        (("--scale", "quick", "--method.agent.lanes", "256"), "agent.discount", 0.97),
-        (("--scale", "quick", "--method.share", "0.5"), "share", 0.5),
-        (("--scale", "0.1", "--method.look-ahead", "80"), "look_ahead", 80),
+        (("--scale", "quick", "--method.agent.discounting", "0.99"), "agent.discounting", 0.99),
+        (("--scale", "quick", "--method.agent.num-envs", "256"), "agent.discounting", 0.97),
+        (("--scale", "quick", "--method.fraction", "0.5"), "fraction", 0.5),
+        (("--scale", "0.1", "--method.goal-horizon", "80"), "goal_horizon", 80),
         (("--scale", "0.1", "--method.fit.updates", "5000"), "fit.updates", 5000),
         (
             (
@@ -89,18 +96,26 @@ def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
             "fit.updates",
             2000,
         ),
-        (("--literal", "--method.look-ahead", "7"), "look_ahead", 7),
-        (("--literal", "--method.fit.latent-weight", "0.9"), "fit.latent_weight", 0.9),
-        (("--literal", "--method.generalize.mode", "segments"), "generalize.mode", "segments"),
+        (("--paper-settings", "--method.goal-horizon", "7"), "goal_horizon", 7),
+        (
+            ("--paper-settings", "--method.fit.latent-loss-weight", "0.9"),
+            "fit.latent_loss_weight",
+            0.9,
+        ),
+        (
+            ("--paper-settings", "--method.generalize.mode", "segments"),
+            "generalize.mode",
+            "segments",
+        ),
         (("--method.generalize.segment", "20"), "generalize.segment", 20),
     ],
 )
 def test_what_the_user_sets_is_what_is_run(
     flags: tuple[str, ...], name: str, value: object, monkeypatch, tmp_path: Path
 ) -> None:
-    ran: list[run_module.Cell] = []
+    ran: list[run_module.Run] = []
     (tmp_path / "table.txt").write_text("")
-    monkeypatch.setattr(command_module, "run_to_the_end", lambda c, _: ran.append(c) or tmp_path)
+    monkeypatch.setattr(command_module, "execute", lambda c, _: ran.append(c) or tmp_path)
     monkeypatch.setattr(sys, "argv", ["ant_lr", *flags])
     command_module.main(Point, methods.LR)
     made = functools.reduce(getattr, name.split("."), ran[0].method)
@@ -108,15 +123,17 @@ def test_what_the_user_sets_is_what_is_run(
 
 
 def test_who_has_set_what_is_known(monkeypatch, tmp_path: Path) -> None:
-    ran: list[run_module.Cell] = []
+    ran: list[run_module.Run] = []
     (tmp_path / "table.txt").write_text("")
-    monkeypatch.setattr(command_module, "run_to_the_end", lambda c, _: ran.append(c) or tmp_path)
-    monkeypatch.setattr(sys, "argv", ["lr", "--scale", "0.1", "--method.fit.batch", "64"])
+    monkeypatch.setattr(command_module, "execute", lambda c, _: ran.append(c) or tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lr", "--scale", "0.1", "--method.fit.batch-size", "64"])
     command_module.main(Point, methods.LR)
     chosen, given, papers = ran[0].notes
     assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
-    assert given == "LR, set by you: fit.batch 64 (512)"
-    assert papers.startswith("LR, not the paper's (--literal has those): fit.averaged False (True)")
+    assert given == "LR, set by you: fit.batch_size 64 (512)"
+    assert papers.startswith(
+        "LR, not the paper's (--paper-settings has those): fit.mean_latent False (True)"
+    )
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 10**30, 1.5])
@@ -161,11 +178,11 @@ def test_runs_are_tested_again_side_by_side(direct: Finished, capsys, monkeypatc
 def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(ROBOTS, "point", Point)
     runs = (stage_of(direct.out, "VGCP"),) * 2
-    waypoints.main(runs, robots=2, out=tmp_path, settings=Follow(max_steps=20, chunk=10))
+    waypoints.main(runs, robots=2, out=tmp_path, settings=WaypointSettings(max_steps=20, chunk=10))
     written = json.loads((tmp_path / "point_waypoints.json").read_text())
     assert list(written["methods"]) == ["VGCP", f"VGCP, {runs[0].name}"]
     one, again = written["methods"].values()
-    assert one == again and one["journeys"] == 2 and len(one["reached"]) == 5
+    assert one == again and one["runs"] == 2 and len(one["reached"]) == 5
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
     assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
     for wrong, robots, why in (((), 1, "of a run"), (runs, 0, "robots must")):
@@ -208,14 +225,14 @@ def refused(out: Path, capsys, why: str, *flags: str, **options) -> None:
     [
         (("--scale", "huge"), "'huge'"),
         (("--scale", "-0.5"), "--scale"),
-        (("--method.fit.latent-weight", "1.5"), "λ"),
-        (("--method.fit.latent-weight", "0"), "λ"),
+        (("--method.fit.latent-loss-weight", "1.5"), "λ"),
+        (("--method.fit.latent-loss-weight", "0"), "λ"),
         (("--method.fit.latent-size", "0"), "k (latent_size)"),
-        (("--method.look-ahead", "0"), "look_ahead"),
-        (("--method.share", "2"), "share"),
-        (("--method.agent.epochs", "0"), "epochs"),
+        (("--method.goal-horizon", "0"), "goal_horizon"),
+        (("--method.fraction", "2"), "fraction"),
+        (("--method.agent.num-updates-per-batch", "0"), "num_updates_per_batch"),
         (("--episodes", "0"), "episodes must be at least 1"),
-        (("--test.lanes", "0"), "lanes"),
+        (("--test.num-envs", "0"), "num_envs"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(
@@ -228,10 +245,10 @@ def test_settings_that_cannot_be_are_refused(
 @pytest.mark.parametrize(
     ("flags", "why"),
     [
-        (("--method.agent.discount", "1"), "discount"),
-        (("--method.agent.her.goals", "0"), "goals must be at least 1"),
-        (("--method.agent.capacity", "7"), "buffer"),
-        (("--method.task.reach", "0"), "reach"),
+        (("--method.agent.discounting", "1"), "discounting"),
+        (("--method.agent.her.n-sampled-goal", "0"), "n_sampled_goal must be at least 1"),
+        (("--method.agent.max-replay-size", "7"), "buffer"),
+        (("--method.task.goal-radius", "0"), "goal_radius"),
     ],
 )
 def test_settings_that_no_learner_can_have_are_refused(
@@ -263,14 +280,14 @@ def test_nan_in_the_experience_is_refused(copy: Path, capsys) -> None:
     refused(copy, capsys, "o holds NaN")
 
 
-def test_a_torn_experience_is_refused(copy: Path, capsys) -> None:
+def test_a_corrupt_experience_is_refused(copy: Path, capsys) -> None:
     forget(copy, "test-LR", "LR", "replay")
     file = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000" / "s.npy"
     file.write_bytes(file.read_bytes()[:-1])
     refused(copy, capsys, "cut short")
 
 
-def test_a_torn_controller_is_refused(copy: Path, capsys) -> None:
+def test_a_corrupt_controller_is_refused(copy: Path, capsys) -> None:
     forget(copy, "test-LR")
     (stage_of(copy, "LR") / "controller" / "mean.npy").unlink()
     refused(copy, capsys, "mean.npy is missing")

@@ -44,7 +44,7 @@ class Other:
 
 
 def test_plain_is_readable_json() -> None:
-    plain = config.plain({"c": Config(), "f": jnp.tanh, "x": np.float32(0.5), "bad": np.inf})
+    plain = config.to_json({"c": Config(), "f": jnp.tanh, "x": np.float32(0.5), "bad": np.inf})
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["c"]["class"] == "Config"
     assert plain["c"]["inner"]["colour"] == "Colour.RED"

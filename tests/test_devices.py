@@ -19,14 +19,14 @@ from genidm import devices
 from genidm.agents.frozen import Frozen
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test, flatten
+from genidm.evaluation.evaluate import EvaluationSettings, flatten
 from genidm.evaluation.evaluator import Evaluator
 from genidm.evaluation.scenarios import scenarios
 from genidm.paper import methods
 from genidm.paper.fit import Fit, fit
 from genidm.paper.pairs import Pairs
 from genidm.robots import Humanoid
-from genidm.runs.cell import cell
+from genidm.runs.cell import make_run
 from genidm.runs.resolve import Options
 from genidm.tasks import WalkForward
 
@@ -42,26 +42,34 @@ def accelerator(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_cpu_has_no_memory_of_its_own():
     assert devices.memory() is None
-    assert devices.at_once(7) == 7
-    assert devices.home(10**18) == jax.devices()[0]
+    assert devices.max_parallel_envs(7) == 7
+    assert devices.pick_device(10**18) == jax.devices()[0]
 
 
 def test_more_robots_at_once_where_there_is_room(accelerator):
     accelerator(80 * GB)
-    assert devices.at_once(512) == devices.BUSY
-    assert devices.at_once(10 * devices.BUSY) == 10 * devices.BUSY
+    assert devices.max_parallel_envs(512) == devices.BUSY
+    assert devices.max_parallel_envs(10 * devices.BUSY) == 10 * devices.BUSY
     accelerator(GB)
-    assert 512 < devices.at_once(512) < devices.BUSY
+    assert 512 < devices.max_parallel_envs(512) < devices.BUSY
     accelerator(GB // 1000)
-    assert devices.at_once(512) == 512
+    assert devices.max_parallel_envs(512) == 512
 
 
 def test_the_test_and_the_replay_take_what_there_is_room_for(accelerator):
-    bank = flatten(scenarios(ROBOT, seeds=2, episodes=3000))
+    tested_scenarios = flatten(scenarios(ROBOT, seeds=2, episodes=3000))
     mesh = devices.mesh(jax.devices()[:1])
-    narrow = Evaluator(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
+    narrow = (
+        Evaluator(ROBOT, tested_scenarios, EvaluationSettings(), mesh)
+        .start()
+        .running.target.shape[0]
+    )
     accelerator(80 * GB)
-    wide = Evaluator(ROBOT, bank, Test(), mesh).start().running.target.shape[0]
+    wide = (
+        Evaluator(ROBOT, tested_scenarios, EvaluationSettings(), mesh)
+        .start()
+        .running.target.shape[0]
+    )
     assert (narrow, wide) == (512, devices.BUSY)
 
 
@@ -69,29 +77,32 @@ def test_samples_lie_beside_a_copy_of_them_or_on_the_cpu(accelerator, monkeypatc
     accelerator(10 * GB)
     kinds = {None: ["accelerator"], "cpu": ["cpu"]}
     monkeypatch.setattr(jax, "devices", lambda kind=None: kinds[kind])
-    assert devices.home(4 * GB) == "accelerator"
-    assert devices.home(5 * GB) == "cpu"
+    assert devices.pick_device(4 * GB) == "accelerator"
+    assert devices.pick_device(5 * GB) == "cpu"
 
 
 def test_an_off_policy_agent_goes_wide_with_as_many_steps_between_updates(accelerator):
     agent = SAC()
-    wide = agent.wide()
-    assert (wide.lanes, wide.unroll) == (agent.lanes * agent.unroll, 1)
-    assert dataclasses.replace(wide, lanes=agent.lanes, unroll=agent.unroll) == agent
-    assert Frozen(agent, 0.5).wide().agent == wide
+    wide = agent.for_accelerator()
+    assert (wide.num_envs, wide.unroll_length) == (agent.num_envs * agent.unroll_length, 1)
+    assert (
+        dataclasses.replace(wide, num_envs=agent.num_envs, unroll_length=agent.unroll_length)
+        == agent
+    )
+    assert Frozen(agent, 0.5).for_accelerator().agent == wide
     lr, options = methods.by_name("LR", "humanoid"), Options()
     ppo = methods.by_name("LR", "ant")
-    assert cell(Humanoid(), lr, options).method.agent == lr.agent
+    assert make_run(Humanoid(), lr, options).method.agent == lr.agent
     accelerator(80 * GB)
-    assert cell(Humanoid(), lr, options).method.agent == lr.agent.wide()
-    assert cell(Humanoid(), ppo, options).method.agent == ppo.agent
+    assert make_run(Humanoid(), lr, options).method.agent == lr.agent.for_accelerator()
+    assert make_run(Humanoid(), ppo, options).method.agent == ppo.agent
 
 
 def test_a_buffer_that_does_not_fit_is_refused(accelerator):
-    agent = SAC(lanes=16, unroll=2, capacity=100_000, warmup=0)
+    agent = SAC(num_envs=16, unroll_length=2, max_replay_size=100_000, min_replay_size=0)
     programs = agent.programs(ROBOT, WalkForward(), devices.mesh(jax.devices()[:1]))
     accelerator(GB // 1000)
-    with pytest.raises(BadInput, match="capacity"):
+    with pytest.raises(BadInput, match="max_replay_size"):
         jax.eval_shape(programs.start, jax.random.key(0))
     accelerator(GB)
     jax.eval_shape(programs.start, jax.random.key(0))
@@ -106,8 +117,10 @@ def test_a_fit_learns_where_its_samples_have_room(monkeypatch):
     )
     sizes = []
     second = jax.devices()[1]
-    monkeypatch.setattr(devices, "home", lambda size: sizes.append(size) or second)
-    model = fit(ROBOT, samples, jax.random.key(0), Fit(updates=2, batch=8, idm=(4,)), quiet=True)
+    monkeypatch.setattr(devices, "pick_device", lambda size: sizes.append(size) or second)
+    model = fit(
+        ROBOT, samples, jax.random.key(0), Fit(updates=2, batch_size=8, idm=(4,)), quiet=True
+    )
     assert model.mean.devices() == {second}
     assert sizes == [sum(x.nbytes for x in (samples.s, samples.d, samples.a))]
 
@@ -125,15 +138,15 @@ from genidm.agents.collect import collect
 from genidm.evaluation.evaluate import evaluate
 from genidm.paper.generalize import Generalize, generalize
 from genidm.evaluation.scenarios import scenarios
-from genidm.evaluation.waypoints import Follow, follow
+from genidm.evaluation.waypoints import WaypointSettings, follow_waypoints
 robot = Point()
 straight = Straight(jnp.float32(1.0), robot)
-record, _ = collect(robot, RandomActions(lanes=14, unroll=8), 300, quiet=True)
+record, _ = collect(robot, RandomActions(num_envs=14, unroll_length=8), 300, quiet=True)
 pairs, residual = generalize(
-    robot, record, jax.random.key(0), Generalize(segment=6, lanes=10), look_ahead=5)
+    robot, record, jax.random.key(0), Generalize(segment=6, num_envs=10), goal_horizon=5)
 found = evaluate(robot, straight, scenarios(robot, 1, 7), TEST, quiet=True)
-made = follow(robot, straight, [[1.0, 0.0]], jax.random.split(jax.random.key(0), 7),
-    np.zeros(7), settings=Follow(40, chunk=10), quiet=True)
+made = follow_waypoints(robot, straight, [[1.0, 0.0]], jax.random.split(jax.random.key(0), 7),
+    np.zeros(7), settings=WaypointSettings(40, chunk=10), quiet=True)
 print(json.dumps(dict(
     devices=jax.device_count(), s=np.abs(record.s).sum(), steps=record.interactions,
     d=np.abs(pairs.d).sum(), residual=residual["median"].max(),

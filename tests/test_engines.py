@@ -179,7 +179,7 @@ def test_a_lost_lane_comes_back_as_nan_alone(
     lost = np.any([np.isnan(x).reshape(LANES, -1).any(1) for x in jax.tree.leaves(got)], axis=0)
     assert np.flatnonzero(lost).tolist() == [3, 5]
     bits.same(lanes(got, ~lost), lanes(whole, ~lost))
-    robots = robot.place(physics, jnp.zeros(LANES))
+    robots = robot.set_state(physics, jnp.zeros(LANES))
     assert np.array_equal(robot.step(robots, jnp.asarray(actions[0])).diverged, lost)
     assert not list(tmp_path.iterdir())
 
@@ -215,7 +215,7 @@ def test_lanes_are_alike(kind: str, robot: MujocoRobot) -> None:
 def test_threads_change_no_bit(kind: str, in_c: MujocoRobot) -> None:
     (action,) = actions_of(in_c, 1)
     for threads in (1, 2, 3):
-        engine = MuJoCo(in_c.drawing(), in_c.frames, threads)
+        engine = MuJoCo(in_c.visual_model(), in_c.frame_skip, threads)
         assert engine.threads == threads
         bits.same(engine.step(starts(kind), action), in_c.engine.step(starts(kind), action))
 
@@ -226,7 +226,7 @@ def test_engines_observe_alike(kind: str) -> None:
     start.qpos[:2, 2], start.qpos[1, 3:7] = (3.0, 0.7), np.sqrt([0.5, 0.5, 0, 0])
     (action,) = actions_of(made(kind, "mujoco"), 1)
     c, x = (
-        robot.step(robot.place(start, jnp.zeros(LANES)), jnp.asarray(action))
+        robot.step(robot.set_state(start, jnp.zeros(LANES)), jnp.asarray(action))
         for robot in (made(kind, "mujoco"), made(kind, "mjx"))
     )
     fields = ("observation", "position", "heading")
@@ -241,7 +241,7 @@ def test_engines_observe_alike(kind: str) -> None:
 
 def record(robot: MujocoRobot, actions: np.ndarray) -> Experience:
     """The experience of actions `[T, B, A]`, all valid and of one episode."""
-    states = [robot.place(starts(robot.name), jnp.zeros(LANES))]
+    states = [robot.set_state(starts(robot.name), jnp.zeros(LANES))]
     for action in actions:
         states.append(robot.step(states[-1], jnp.asarray(action)))
     before, after = (jax.tree.map(lambda *x: np.stack(x), *s) for s in (states[:-1], states[1:]))
@@ -259,7 +259,7 @@ def test_turned_replays_drift_alike() -> None:
     for engine in ENGINES:
         robot = made("ant", engine)
         experience = record(robot, actions_of(robot, STEPS))
-        settings = Generalize(segment=STEPS, lanes=LANES)
+        settings = Generalize(segment=STEPS, num_envs=LANES)
         turned = replay(robot, experience, jax.random.key(0), settings, quiet=True)
         drift = residual(experience, turned)
         assert drift["step"].tolist() == list(range(1, STEPS + 1))
@@ -292,7 +292,10 @@ def test_an_unknown_engine_is_refused() -> None:
 @pytest.mark.parametrize("threads", [2, 3])
 def test_a_record_does_not_depend_on_the_threads(threads: int) -> None:
     """Through a whole stage: PPO walks and learns on MuJoCo in C."""
-    agent, records = PPO(lanes=12, unroll=8, minibatches=2, epochs=1), []
+    agent, records = (
+        PPO(num_envs=12, unroll_length=8, num_minibatches=2, num_updates_per_batch=1),
+        [],
+    )
     for count in (1, threads):
         robot = Ant(engine="mujoco")
         assert isinstance(robot.engine, MuJoCo)

@@ -27,9 +27,9 @@ def python(code: str, *, cwd: Path = ROOT, **env: str | None) -> subprocess.Comp
 
 CACHE = "import genidm.devices, jax; print(jax.config.jax_compilation_cache_dir)"
 COMMAND = (
-    "from genidm.runs.command import guarded\n"
+    "from genidm.runs.command import run_cli\n"
     "def run() -> None:\n    print('ran ≤')\n"
-    "guarded(run, 'A command.')"
+    "run_cli(run, 'A command.')"
 )
 
 
@@ -78,7 +78,7 @@ def test_a_variable_that_is_no_number_is_said_in_a_sentence(name: str, value: st
 
 SAVING = """
 import sys, numpy as np
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 from genidm.checkpoints import Checkpoints
 where = sys.argv.pop()
 def run() -> None:
@@ -88,7 +88,7 @@ def run() -> None:
         kept.save(step, tree)
         if not step:
             print("began", flush=True)
-guarded(run, "A command.")
+run_cli(run, "A command.")
 """
 
 

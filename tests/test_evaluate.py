@@ -18,40 +18,47 @@ from genidm import checkpoints, devices
 from genidm.errors import BadInput
 from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluate import Test, evaluate, flatten, run, walking_speed
-from genidm.evaluation.scenarios import Scenarios, scenarios, tours
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate, flatten, run, walking_speed
+from genidm.evaluation.scenarios import Scenarios, fig8_scenarios, scenarios
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import State
 from genidm.store import Stage
 
 SEEDS, EPISODES = 2, 15
-FAST = dict(lanes=64, chunk=50)
+FAST = dict(num_envs=64, chunk=50)
 
 
 @functools.cache
-def bank() -> Scenarios:
-    """One for all points: a bank does not see how they go, fall or diverge."""
+def tested_scenarios() -> Scenarios:
+    """The same for all points: they do not see how they go, fall or diverge."""
     return scenarios(Point(), SEEDS, EPISODES)
 
 
 def steer(robot: Point, pace: float = 1.0, mesh=None, stage=None, **settings) -> Episodes:
     return evaluate(
-        robot, Straight(jnp.float32(pace), robot), bank(), Test(**(FAST | settings)),
-        mesh=mesh, stage=stage, quiet=True,
-    )  # fmt: skip
+        robot,
+        Straight(jnp.float32(pace), robot),
+        tested_scenarios(),
+        EvaluationSettings(**(FAST | settings)),
+        mesh=mesh,
+        stage=stage,
+        quiet=True,
+    )
 
 
 @functools.cache
 def starts_and_targets() -> list[tuple[np.ndarray, np.ndarray]]:
-    start, flat = starts(Point(), bank()), flatten(bank())
+    start, flat = starts(Point(), tested_scenarios()), flatten(tested_scenarios())
     return list(zip(np.float64(start.position), np.float64(flat.target), strict=True))
 
 
 def closed_form(
-    robot: Point, pace: float, max_steps: int = 1000, reach: float = 0.1
+    robot: Point, pace: float, max_steps: int = 1000, goal_radius: float = 0.1
 ) -> tuple[Episodes, list[np.ndarray]]:
-    """What becomes of each episode of the bank, and its way, in NumPy and float64."""
-    rows = [one_episode(robot, pace, max_steps, reach, *ends) for ends in starts_and_targets()]
+    """What becomes of each episode of the scenarios, and its way, in NumPy and float64."""
+    rows = [
+        one_episode(robot, pace, max_steps, goal_radius, *ends) for ends in starts_and_targets()
+    ]
     outcome = {
         f.name: np.array([getattr(row, f.name) for row in rows]).reshape(SEEDS, EPISODES)
         for f in dataclasses.fields(Episodes)
@@ -59,14 +66,14 @@ def closed_form(
     return Episodes(**outcome), [row.way for row in rows]
 
 
-def one_episode(robot, pace, max_steps, reach, start, target) -> SimpleNamespace:
-    stride = pace * robot.speed * robot.control_step
+def one_episode(robot, pace, max_steps, goal_radius, start, target) -> SimpleNamespace:
+    stride = pace * robot.speed * robot.dt
     level = (target - start) * [1, 1, 0]
     there = np.linalg.norm(level)
     n = np.arange(max_steps + 1)
     way = start + n[:, None] * stride * level / there
     far, out = np.abs(there - n * stride), np.linalg.norm(way[:, :2], axis=-1)
-    reached, fell, lost = far <= reach, out > robot.falls_at, out > robot.diverges_at
+    reached, fell, lost = far <= goal_radius, out > robot.falls_at, out > robot.diverges_at
     steps = next(i for i in n[1:] if reached[i] or fell[i] or lost[i] or i == max_steps)
     moves = steps - lost[steps]  # the step in which it diverges leads nowhere
     way = np.concatenate([way[: moves + 1], way[moves : moves + steps - moves]])
@@ -124,8 +131,8 @@ def test_what_diverges_is_counted_and_is_in_no_mean() -> None:
 def test_an_episode_ends_at_the_step_limit_and_at_the_reach_radius() -> None:
     robot = Point()
     agree(steer(robot, max_steps=60), closed_form(robot, 1.0, max_steps=60)[0])
-    episodes = steer(robot, reach=1.0)
-    agree(episodes, closed_form(robot, 1.0, reach=1.0)[0])
+    episodes = steer(robot, goal_radius=1.0)
+    agree(episodes, closed_form(robot, 1.0, goal_radius=1.0)[0])
     assert (episodes.closest > 0.9).all()
 
 
@@ -135,16 +142,21 @@ def test_an_episode_ends_at_the_step_limit_and_at_the_reach_radius() -> None:
 def test_nothing_depends_on_lanes_or_chunk_or_devices(lanes: int, chunk: int, cores: int) -> None:
     robot = Point(falls_at=4.0, diverges_at=4.02)
     mesh = devices.mesh(jax.devices()[:cores])
-    episodes = steer(robot, lanes=lanes, chunk=chunk, mesh=mesh)
+    episodes = steer(robot, num_envs=lanes, chunk=chunk, mesh=mesh)
     agree(episodes, closed_form(robot, 1.0)[0])
     assert all(x.any() for x in (episodes.fell, episodes.diverged, episodes.reached))
 
 
 def test_ways_are_traced_from_start_to_end() -> None:
     robot = Point(diverges_at=3.5)
-    steering = Straight(jnp.float32(1.0), robot)
+    controller = Straight(jnp.float32(1.0), robot)
     outcome, ways = run(
-        robot, steering, flatten(bank()), Test(lanes=6, chunk=50), traced=9, quiet=True
+        robot,
+        controller,
+        flatten(tested_scenarios()),
+        EvaluationSettings(num_envs=6, chunk=50),
+        traced=9,
+        quiet=True,
     )
     expected, closed = closed_form(robot, 1.0)
     np.testing.assert_array_equal(outcome.steps, expected.steps.ravel())
@@ -155,7 +167,9 @@ def test_ways_are_traced_from_start_to_end() -> None:
 
 def test_one_lane_wastes_no_step(tmp_path: Path) -> None:
     robot, stage = Point(), Stage.open(tmp_path, "test", {})
-    episodes = steer(robot, lanes=1, chunk=100, mesh=devices.mesh(jax.devices()[:1]), stage=stage)
+    episodes = steer(
+        robot, num_envs=1, chunk=100, mesh=devices.mesh(jax.devices()[:1]), stage=stage
+    )
     calls = -(-episodes.steps.sum() // 100)
     last = read_metrics(stage.path(METRICS))[-1]
     assert last["useful"] == pytest.approx(episodes.steps.sum() / (100 * calls))
@@ -168,16 +182,16 @@ def test_a_killed_test_goes_on_to_the_same_bits(
 ) -> None:
     """On other devices it begins anew: its queues belong to them, and lanes go by their memory."""
     robot, stage = Point(falls_at=4.0), Stage.open(tmp_path, "test", {})
-    whole = steer(robot, lanes=8)
+    whole = steer(robot, num_envs=8)
     monkeypatch.setattr(checkpoints, "CHECKPOINT_SECONDS", 0)
     with monkeypatch.context() as m:
         m.setattr(Progress, "advance", dies_at(3))
         with pytest.raises(Killed):
-            steer(robot, lanes=8, stage=stage)
+            steer(robot, num_envs=8, stage=stage)
     calls = []
     count = Progress.advance
     monkeypatch.setattr(Progress, "advance", lambda *a, **k: (calls.append(a), count(*a, **k)))
-    resumed = steer(robot, lanes=lanes, stage=stage, mesh=devices.mesh(jax.devices()[:cores]))
+    resumed = steer(robot, num_envs=lanes, stage=stage, mesh=devices.mesh(jax.devices()[:cores]))
     goes_on = (cores, lanes) == (2, 8)
     if goes_on:
         for x, y in zip(dataclasses.astuple(whole), dataclasses.astuple(resumed), strict=True):
@@ -188,10 +202,12 @@ def test_a_killed_test_goes_on_to_the_same_bits(
     assert len(calls) == len(steps) - 2 * goes_on
 
 
-@pytest.mark.parametrize("wrong", [{"lanes": 0}, {"max_steps": 0}, {"chunk": 0}, {"reach": -0.1}])
+@pytest.mark.parametrize(
+    "wrong", [{"num_envs": 0}, {"max_steps": 0}, {"chunk": 0}, {"goal_radius": -0.1}]
+)
 def test_settings_that_make_no_test_are_refused(wrong: dict) -> None:
     with pytest.raises(BadInput, match=next(iter(wrong))):
-        Test(**wrong)
+        EvaluationSettings(**wrong)
 
 
 # ── scenarios ───────────────────────────────────────────────────────────────────────────
@@ -206,8 +222,15 @@ def same(a: Scenarios, b: Scenarios) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(numbers(a), numbers(b), strict=True))
 
 
-def numbers(bank: Scenarios) -> list[np.ndarray]:
-    return [np.asarray(x) for x in (jax.random.key_data(bank.keys), bank.yaw, bank.target)]
+def numbers(tested_scenarios: Scenarios) -> list[np.ndarray]:
+    return [
+        np.asarray(x)
+        for x in (
+            jax.random.key_data(tested_scenarios.keys),
+            tested_scenarios.yaw,
+            tested_scenarios.target,
+        )
+    ]
 
 
 @pytest.mark.parametrize(
@@ -220,7 +243,7 @@ def numbers(bank: Scenarios) -> list[np.ndarray]:
 )  # fmt: skip
 def test_a_controller_that_answers_something_else_is_refused(answer, given: str) -> None:
     with pytest.raises(BadInput, match=rf"the controller must answer .* not {given}"):
-        evaluate(Point(), answer, bank(), Test(**FAST), quiet=True)
+        evaluate(Point(), answer, tested_scenarios(), EvaluationSettings(**FAST), quiet=True)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +274,7 @@ def test_how_fast_nobody_walks_is_not_told(wrong: dict) -> None:
 def test_a_bank_is_a_function_of_robot_and_seed_alone() -> None:
     more = scenarios(Point(speed=9.0), 5, 40)
     assert more.shape == (5, 40)
-    assert same(jax.tree.map(lambda x: x[:SEEDS, :EPISODES], more), bank())
+    assert same(jax.tree.map(lambda x: x[:SEEDS, :EPISODES], more), tested_scenarios())
     assert same(jax.tree.map(lambda x: x[3:, :7], more), scenarios(Point(), 2, 7, first_seed=3))
     keys = np.asarray(jax.random.key_data(more.keys)).reshape(200, -1)
     assert len(np.unique(keys, axis=0)) == len(np.unique(more.yaw)) == 200
@@ -293,7 +316,7 @@ def test_another_robot_has_other_targets() -> None:
 
 
 def test_the_digest_is_stable_and_sees_every_number() -> None:
-    one = bank()
+    one = tested_scenarios()
     assert one.digest() == scenarios(Point(), SEEDS, EPISODES).digest() and len(one.digest()) == 64
     ulp = [jnp.nextafter(x, jnp.inf) for x in (one.yaw[1, -1], one.target[1, -1, 2])]
     others = [
@@ -308,7 +331,7 @@ def test_the_digest_is_stable_and_sees_every_number() -> None:
 
 def test_the_tours_start_alike_and_one_row_faces_away() -> None:
     robot = Point()
-    walks = tours(robot)
+    walks = fig8_scenarios(robot)
     start = jax.tree.map(lambda x: np.asarray(x).reshape(2, 10, -1), starts(robot, walks))
     assert walks.shape == (2, 10) and np.ptp(start.heading[0]) == 0
     way, turned = np.asarray(walks.target) - start.position

@@ -1,4 +1,4 @@
-"""docs/extending.md, followed to the letter: a robot and an engine, from the class to the film."""
+"""docs/extending.md, followed to the letter: a robot and an engine, from the class to the video."""
 
 from __future__ import annotations
 
@@ -16,21 +16,29 @@ import pytest
 from in_c import assert_close, placed, positive_w, step_in_c
 
 from experiments import evaluate, physics, train
-from genidm import controller, engines, robots
-from genidm.config import plain
+from genidm import engines, robots
+from genidm.config import to_json
+from genidm.controller import load as load_controller
 from genidm.engines import ENGINES, Engine, Physics
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.robots import ROBOTS, Ant, Robot, by_name, remade
 from genidm.robots.mujoco import MujocoRobot
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
-TEST = Test(max_steps=20, lanes=4, chunk=10)
+TEST = EvaluationSettings(max_steps=20, num_envs=4, chunk=10)
 SMALL = (
     *("--scale", "0.0005", "--episodes", "2", "--engine", "mujoco"),
-    *("--test.max-steps", "20", "--test.lanes", "4", "--test.chunk", "10"),
-    *("--method.agent.lanes", "16", "--method.agent.unroll", "8", "--method.look-ahead", "5"),
-    *("--method.fit.updates", "20", "--method.fit.batch", "16"),
+    *("--test.max-steps", "20", "--test.num-envs", "4", "--test.chunk", "10"),
+    *(
+        "--method.agent.num-envs",
+        "16",
+        "--method.agent.unroll-length",
+        "8",
+        "--method.goal-horizon",
+        "5",
+    ),
+    *("--method.fit.updates", "20", "--method.fit.batch-size", "16"),
 )
 BEETLE = """
 <mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="9 9 1"/>
@@ -83,7 +91,7 @@ def test_the_page_robot_goes_all_the_way(
     toy: type[MujocoRobot], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Collected, replayed, fitted, tested, filmed and shown; then loaded and tested again."""
-    where = ("--out", str(tmp_path), "--results", str(tmp_path / "shown"), "--video")
+    where = ("--run-dir", str(tmp_path), "--report-dir", str(tmp_path / "shown"), "--video")
     command(train.main, "--robot", "toy", *SMALL, *where, "--method", "LR")
     assert re.search(r"^LR +\d\.\d{3} ± \d\.\d{3}", capsys.readouterr().out, re.MULTILINE)
     stages = {path.parent.name.rsplit("-", 1)[0] for path in (tmp_path / "toy").glob("*/done.json")}
@@ -92,9 +100,9 @@ def test_the_page_robot_goes_all_the_way(
     assert (run / "video.html").stat().st_size > 10_000
     (written,) = (tmp_path / "shown").glob("toy*.json")
     assert list(json.loads(written.read_text(encoding="utf-8"))["methods"]) == ["LR"]
-    steering = controller.load(run, engine="mujoco")
-    assert isinstance(steering.robot, toy)
-    assert steering(jnp.zeros((3, 27)).at[:, 1].set(1.0), jnp.ones((3, 3))).shape == (3, 8)
+    controller = load_controller(run, engine="mujoco")
+    assert isinstance(controller.robot, toy)
+    assert controller(jnp.zeros((3, 27)).at[:, 1].set(1.0), jnp.ones((3, 3))).shape == (3, 8)
     evaluate.main((run,), seeds=1, episodes=2, engine="mujoco", test=TEST)
     assert re.search(r"^LR ", capsys.readouterr().out, re.MULTILINE)
 
@@ -106,7 +114,7 @@ def test_its_physics_is_measured(
     """By every engine there is: here, where MJX would take minutes to compile, by one."""
     monkeypatch.setattr(physics, "ENGINES", {"mujoco": ENGINES["mujoco"]})
     monkeypatch.setattr(physics, "SETTINGS", (physics.OURS,))
-    physics.physics(physics.Options(robot="toy", steps=1, lanes=2, out=tmp_path / "x.json"))
+    physics.physics(physics.Options(robot="toy", steps=1, num_envs=2, out=tmp_path / "x.json"))
     written = json.loads((tmp_path / "x.json").read_text(encoding="utf-8"))
     assert [(row["engine"], row["steps"]) for row in written["stability"]] == [
         ("C float32 rows", physics.EPISODE * 2)
@@ -124,7 +132,7 @@ def test_its_defaults_are_gymnasiums(toy: type[MujocoRobot], ant: Ant) -> None:
     assert made.observation.describe() == ant.observation.describe().rsplit("\n", 1)[0]
     keys, yaw = jax.random.split(jax.random.key(0), 3), jnp.array([0.0, 1.0, -2.0])
     state = made.reset(keys, yaw)
-    theirs = ant.place(state.physics, jnp.zeros(3))
+    theirs = ant.set_state(state.physics, jnp.zeros(3))
     bits.same(state.observation, theirs.observation[:, :27])
     action = jnp.full((3, 8), 0.5)
     assert_close(made.cost(state, action), np.full(3, 0.5 * 8 * 0.25), atol=1e-6)
@@ -142,7 +150,7 @@ def beetle(tmp_path: Path) -> MujocoRobot:
 
         name = "beetle"
         model = str(file)
-        frames, control_step = 4, 0.02
+        frame_skip, dt = 4, 0.02
         standing_height, healthy_height = 0.3, (0.1, 1.0)
 
     return Beetle(engine="mujoco")
@@ -208,14 +216,14 @@ def test_the_page_engine_goes_all_the_way(
     loop: type[Engine], toy: type[MujocoRobot], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ["loop" if flag == "mujoco" else flag for flag in SMALL]
-    command(train.main, "--robot=toy", "--method=GE", *flags, "--out", str(tmp_path))
+    command(train.main, "--robot=toy", "--method=GE", *flags, "--run-dir", str(tmp_path))
     shown = capsys.readouterr()
     assert "toy on MuJoCo in C, one robot after another\n" in shown.err
     assert re.search(r"^GE +\d\.\d{3} ", shown.out, re.MULTILINE)
     (config,) = (tmp_path / "toy").glob("replay-segments-0-*/config.json")
     assert '"segment": 50' in config.read_text(encoding="utf-8")
     (run,) = (tmp_path / "toy").glob("GE-0-*")
-    assert isinstance(controller.load(run, engine="loop").robot.engine, loop)
+    assert isinstance(load_controller(run, engine="loop").robot.engine, loop)
 
 
 def test_every_robot_with_a_model_takes_it_and_none_gets_it_unasked(loop: type[Engine]) -> None:
@@ -224,7 +232,7 @@ def test_every_robot_with_a_model_takes_it_and_none_gets_it_unasked(loop: type[E
     assert engines.choose(None, Ant.engines, "ant") in ("mjx", "mujoco")
     assert engines.choose(None, by_name("ant", "mujoco").engines, "ant") != "loop"
     settings = by_name("ant", "loop").settings
-    assert isinstance(remade(plain(settings)).engine, loop)
+    assert isinstance(remade(to_json(settings)).engine, loop)
 
 
 # ── the registries ──────────────────────────────────────────────────────────────────────────
@@ -260,15 +268,15 @@ def test_what_lacks_a_method_is_no_robot_yet() -> None:
 
         name = "half"
 
-    with pytest.raises(
-        BadInput, match=r"^Half is no robot yet: it lacks alive_bonus, control_step, "
-    ):
+    with pytest.raises(BadInput, match=r"^Half is no robot yet: it lacks cost, dt, "):
         robots.register(Half)
     engine = type("Half", (Engine,), {"name": "half"})
     with pytest.raises(BadInput, match=r"^Half is no engine yet: it lacks __str__, label, step$"):
         engines.register(engine)
-    unsized = type("Unsized", (MujocoRobot,), {"name": "unsized", "model": "x.xml", "frames": 5})
-    lacking = "control_step, healthy_height, standing_height"
+    unsized = type(
+        "Unsized", (MujocoRobot,), {"name": "unsized", "model": "x.xml", "frame_skip": 5}
+    )
+    lacking = "dt, healthy_height, standing_height"
     with pytest.raises(BadInput, match=f"^Unsized is no robot yet: it lacks {lacking}$"):
         robots.register(unsized)
     assert not {"half", "unsized"} & {*ROBOTS, *ENGINES}

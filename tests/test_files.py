@@ -14,7 +14,7 @@ from bits import flip, same, truncate
 from genidm import checkpoints, files
 from genidm.checkpoints import Checkpoints
 from genidm.errors import BadInput
-from genidm.files import Torn, load_arrays, save_arrays
+from genidm.files import Corrupt, load_arrays, save_arrays
 from genidm.store import Stage
 
 
@@ -48,10 +48,10 @@ NAMES = ["physics.qpos.npy", "meta.json", "manifest.json"]
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("harm", [flip, truncate, Path.unlink])
-def test_torn_arrays_are_recognised_and_replaced(tmp_path: Path, name: str, harm) -> None:
+def test_corrupt_arrays_are_recognised_and_replaced(tmp_path: Path, name: str, harm) -> None:
     save_arrays(tmp_path / "x", TREE, {})
     harm(tmp_path / "x" / name)
-    with pytest.raises(Torn, match=r"torn|missing"):
+    with pytest.raises(Corrupt, match=r"corrupt|missing"):
         load_arrays(tmp_path / "x")
     if name == "manifest.json" and harm is not flip:  # nobody knows then whose files they are
         with pytest.raises(BadInput, match="something else"):
@@ -61,8 +61,8 @@ def test_torn_arrays_are_recognised_and_replaced(tmp_path: Path, name: str, harm
         assert load_arrays(tmp_path / "x")[1] == {"again": True}
 
 
-def test_missing_arrays_are_torn(tmp_path: Path) -> None:
-    with pytest.raises(Torn, match="missing"):
+def test_missing_arrays_are_corrupt(tmp_path: Path) -> None:
+    with pytest.raises(Corrupt, match="missing"):
         load_arrays(tmp_path / "nowhere")
 
 
@@ -217,9 +217,9 @@ def test_an_array_inside_an_array_is_refused(tmp_path: Path) -> None:
         load_arrays(tmp_path / "x")
 
 
-def test_json_nested_without_end_is_torn(tmp_path: Path) -> None:
+def test_json_nested_without_end_is_corrupt(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[" * 10**6)
-    with pytest.raises(Torn, match="not JSON"):
+    with pytest.raises(Corrupt, match="not JSON"):
         files.load_json(tmp_path / "x.json")
 
 

@@ -38,7 +38,7 @@ def model(latent_size: int | None) -> Controller:
         params=jax.tree.map(jnp.float32, params),
         mean=jnp.float32(rng.normal(size=S)),
         std=jnp.float32(10.0 ** rng.uniform(-2, 1, size=S)),
-        architecture=architecture, frame="world", robot=ROBOT,
+        architecture=architecture, input_frame="world", robot=ROBOT,
     )  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def forward(params: dict, x: np.ndarray) -> np.ndarray:
 
 
 def oracle(
-    model: Controller, params: dict, batch: Pairs, averaged: bool = True
+    model: Controller, params: dict, batch: Pairs, mean_latent: bool = True
 ) -> tuple[float, ...]:
     """L, L1 and L2 (Eq. 5-7); φ sees the mean of two latents, or each of them."""
     s, d, a, mean, std = (np.float64(x) for x in (batch.s, batch.d, batch.a, model.mean, model.std))
@@ -76,20 +76,22 @@ def oracle(
             continue
         gamma, gamma_hat = (forward(params["lfm"], x[view, n]) for view in (0, 1))
         first.append(np.sum((gamma - gamma_hat) ** 2))
-        for seen in [(gamma + gamma_hat) / 2] if averaged else [gamma, gamma_hat]:
+        for seen in [(gamma + gamma_hat) / 2] if mean_latent else [gamma, gamma_hat]:
             second.append(np.sum((forward(params["idm"], seen) - a[n]) ** 2))
     latent, action = np.mean(first or [0.0]), np.mean(second)
     return (WEIGHT * latent + (1 - WEIGHT) * action if first else action), latent, action
 
 
-def losses(latent_size: int | None, averaged: bool = True):
+def losses(latent_size: int | None, mean_latent: bool = True):
     if latent_size is None:
         return loss_plain
-    return functools.partial(loss_siamese, latent_weight=WEIGHT, averaged=averaged)
+    return functools.partial(loss_siamese, latent_loss_weight=WEIGHT, mean_latent=mean_latent)
 
 
 KINDS = pytest.mark.parametrize(
-    ("latent_size", "averaged"), [(None, True), (K, True), (K, False)], ids=["IDM", "mean", "each"]
+    ("latent_size", "mean_latent"),
+    [(None, True), (K, True), (K, False)],
+    ids=["IDM", "mean", "each"],
 )
 
 
@@ -98,10 +100,10 @@ def doubled(params: dict) -> dict:
 
 
 @KINDS
-def test_the_losses_are_those_of_the_paper(latent_size: int | None, averaged: bool) -> None:
+def test_the_losses_are_those_of_the_paper(latent_size: int | None, mean_latent: bool) -> None:
     one, batch = model(latent_size), samples(views=2)
-    loss, info = jax.jit(losses(latent_size, averaged))(one, batch)
-    expected, latent, action = oracle(one, doubled(one.params), batch, averaged)
+    loss, info = jax.jit(losses(latent_size, mean_latent))(one, batch)
+    expected, latent, action = oracle(one, doubled(one.params), batch, mean_latent)
     assert np.abs((batch.s - one.mean) / one.std).max() > 10  # the clip at 10 is in play
     assert loss == pytest.approx(expected, rel=1e-5) and info["loss"] == loss
     assert info["loss_action"] == pytest.approx(action, rel=1e-5)
@@ -111,17 +113,17 @@ def test_the_losses_are_those_of_the_paper(latent_size: int | None, averaged: bo
 
 
 @KINDS
-def test_the_gradient_is_that_of_the_oracle(latent_size: int | None, averaged: bool) -> None:
+def test_the_gradient_is_that_of_the_oracle(latent_size: int | None, mean_latent: bool) -> None:
     """Along random directions, by central differences of the oracle in float64."""
     one, batch = model(latent_size), samples(views=2)
-    loss = losses(latent_size, averaged)
+    loss = losses(latent_size, mean_latent)
     grads = jax.jit(jax.grad(lambda p: loss(one.replace(params=p), batch)[0]))(one.params)
     rng = np.random.default_rng(3)
     for _ in range(5):
         way = jax.tree.map(lambda x: rng.normal(size=x.shape), one.params)
         at = [
             oracle(one, jax.tree.map(lambda p, w, e=e: p + e * w, doubled(one.params), way), batch,
-                   averaged)[0]
+                   mean_latent)[0]
             for e in (-1e-6, 1e-6)
         ]  # fmt: skip
         slope = sum(np.sum(g * w) for g, w in zip(*map(jax.tree.leaves, (grads, way)), strict=True))
@@ -168,7 +170,7 @@ def test_a_plain_batch_holds_all_views_alike() -> None:
 
 # ── fitting ─────────────────────────────────────────────────────────────────────────────
 
-SMALL = Fit(updates=40, batch=32, idm=(8,), lfm=(8,), latent_size=2)
+SMALL = Fit(updates=40, batch_size=32, idm=(8,), lfm=(8,), latent_size=2)
 
 
 def linear(count: int = 4096) -> Pairs:
@@ -194,7 +196,7 @@ def test_a_fit_learns_a_linear_map(latent_size: int | None) -> None:
 @pytest.mark.parametrize("decay", [True, False])
 def test_the_learning_rate_falls_along_a_cosine_unless_it_stays(decay: bool) -> None:
     """Adam's step under a gradient that stays is the learning rate, whatever its length."""
-    optimizer = Fit(updates=40, learning_rate=3e-3, decay=decay).optimizer()
+    optimizer = Fit(updates=40, learning_rate=3e-3, cosine_decay=decay).optimizer()
     state, steps = optimizer.init(jnp.zeros(1)), []
     for _ in range(40):
         step, state = optimizer.update(jnp.full(1, 7.0), state)
@@ -228,7 +230,7 @@ def test_states_are_normalised_by_their_own_statistics() -> None:
 def test_a_heading_frame_is_fitted_to_what_it_will_see() -> None:
     data = samples(views=1, count=500)
     data = data.replace(s=data.s.at[..., 1:5].set(jnp.array([0.0, 0, 0, 1])))  # turned by 180°
-    model = fit(ROBOT, data, jax.random.key(0), GE_SMALL, frame="heading", quiet=True)
+    model = fit(ROBOT, data, jax.random.key(0), GE_SMALL, input_frame="heading", quiet=True)
     np.testing.assert_allclose(model.mean[1:5], [1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(model.mean[5:7], -data.s[0].mean(0)[5:7], atol=1e-5)
 
@@ -281,11 +283,11 @@ def test_a_killed_fit_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch) -> N
 def test_a_controller_comes_back_from_the_disk_as_it_was(
     tmp_path: Path, latent_size: int | None
 ) -> None:
-    one = model(latent_size).replace(frame="heading")
+    one = model(latent_size).replace(input_frame="heading")
     one.save(tmp_path / "controller")
     back = controller.load(tmp_path / "controller", ROBOT)
     assert same(one, back) and jax.tree.structure(one) == jax.tree.structure(back)
-    assert (back.frame, back.architecture) == ("heading", one.architecture)
+    assert (back.input_frame, back.architecture) == ("heading", one.architecture)
     s = samples(views=1).s[0]
     np.testing.assert_array_equal(act(one, s, s[:, :3]), act(back, s, s[:, :3]))
 
@@ -299,7 +301,7 @@ def test_a_controller_of_another_robot_is_refused(tmp_path: Path) -> None:
         controller.load(tmp_path / "controller", Other())
 
 
-def test_a_torn_controller_is_refused(tmp_path: Path) -> None:
+def test_a_corrupt_controller_is_refused(tmp_path: Path) -> None:
     model(K).save(tmp_path / "controller")
     file = next((tmp_path / "controller").glob("params.idm.*.npy"))
     file.write_bytes(file.read_bytes()[:-1])
@@ -344,8 +346,8 @@ def turned(robot, seed: int = 5) -> tuple[tuple, tuple]:
     s = jnp.float32(np.concatenate(s, axis=-1))
     d, yaw = jnp.float32(rng.normal(size=(64, 3))), jnp.linspace(-3.1, 3.1, 64)
     # To turn by nothing makes the quaternions' w positive.
-    s = robot.observation.turn(s, 0 * yaw)
-    return (s, d), (robot.observation.turn(s, yaw), symmetry.turn_vector(d, yaw))
+    s = robot.observation.rotate(s, 0 * yaw)
+    return (s, d), (robot.observation.rotate(s, yaw), symmetry.rotate_vector(d, yaw))
 
 
 def test_the_heading_frame_does_not_see_a_turn(ant: Ant) -> None:
@@ -363,7 +365,7 @@ def test_the_heading_frame_does_not_see_a_turn(ant: Ant) -> None:
 def test_a_controller_in_the_heading_frame_steers_alike_after_a_turn() -> None:
     here, there = turned(ROBOT)
     one = model(K).replace(std=jnp.ones(S))
-    heading = one.replace(frame="heading")
+    heading = one.replace(input_frame="heading")
     np.testing.assert_allclose(act(heading, *here), act(heading, *there), atol=1e-4)
     assert np.abs(act(one, *here) - act(one, *there)).max() > 0.1
 
@@ -374,7 +376,7 @@ def test_a_controller_in_the_heading_frame_steers_alike_after_a_turn() -> None:
 @pytest.mark.parametrize("weight", [0.0, 1.0, -0.1, 1.5, float("nan")])
 def test_a_latent_weight_outside_0_and_1_is_refused(weight: float) -> None:
     with pytest.raises(BadInput, match="λ"):
-        Fit(latent_weight=weight)
+        Fit(latent_loss_weight=weight)
 
 
 @pytest.mark.parametrize("latent_size", [0, -3])
@@ -383,7 +385,7 @@ def test_a_latent_of_less_than_one_number_is_refused(latent_size: int) -> None:
         Fit(latent_size=latent_size)
 
 
-@pytest.mark.parametrize("wrong", [{"updates": 0}, {"batch": 0}])
+@pytest.mark.parametrize("wrong", [{"updates": 0}, {"batch_size": 0}])
 def test_a_fit_of_nothing_is_refused(wrong: dict) -> None:
     with pytest.raises(BadInput, match="at least 1"):
         Fit(**wrong)
@@ -391,7 +393,7 @@ def test_a_fit_of_nothing_is_refused(wrong: dict) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"look_ahead": 0}, {"share": 0.0}, {"share": 1.5}, {"name": "a/b"}, {"name": ".."}],
+    [{"goal_horizon": 0}, {"fraction": 0.0}, {"fraction": 1.5}, {"name": "a/b"}, {"name": ".."}],
 )
 def test_methods_refuse_what_they_cannot_do(wrong: dict) -> None:
     """A name begins those of directories."""
@@ -414,5 +416,5 @@ def test_a_fit_that_ends_in_nan_is_refused(tmp_path: Path, latent_size: int | No
         return {}
 
     with pytest.raises(BadInput, match=r"params/\S+ holds NaN or infinity after \d+ updates"):
-        stage.once(work)
+        stage.run_once(work)
     assert not stage.done

@@ -24,7 +24,7 @@ from genidm.errors import BadInput
 from genidm.evaluation.scenarios import scenarios
 from genidm.paper import methods
 from genidm.progress import Progress
-from genidm.runs.cell import cell
+from genidm.runs.cell import make_run
 from genidm.runs.resolve import Options
 from genidm.tasks import WalkForward
 
@@ -42,7 +42,7 @@ def test_it_acts_as_it_had_learned_to(agent: PPO | SAC) -> None:
     learning = acting.learning(robot, TASK, mesh)
     lanes = learning.place(learning.start(jax.random.key(3)))
     programs = agent.programs(robot, TASK, mesh)
-    chosen = programs.acting(programs.place(learner).training)
+    chosen = programs.acting(programs.place(learner).training_state)
     after, expected, _, _ = programs.stepping(*chosen, jax.tree.map(jax.numpy.copy, lanes))
     got_lanes, got, _ = learning.prepare(lanes)(lanes)
     np.testing.assert_array_equal(got.a, expected.a)
@@ -55,20 +55,22 @@ def test_it_acts_as_it_had_learned_to(agent: PPO | SAC) -> None:
 
 
 @pytest.fixture(scope="module")
-def rl() -> methods.Inverse:
-    return tiny(methods.RL, agent=Frozen(LEARNER, share=0.5))
+def rl() -> methods.InverseDynamics:
+    return tiny(methods.RL, agent=Frozen(LEARNER, fraction=0.5))
 
 
 def options(out: Path, **changes) -> Options:
-    return dataclasses.replace(Options(scale="0.5", out=out, episodes=2, test=TEST), **changes)
+    return dataclasses.replace(Options(scale="0.5", run_dir=out, episodes=2, test=TEST), **changes)
 
 
-def test_its_learning_is_counted_and_not_recorded(rl: methods.Inverse, tmp_path: Path) -> None:
+def test_its_learning_is_counted_and_not_recorded(
+    rl: methods.InverseDynamics, tmp_path: Path
+) -> None:
     # At full scale it learns for the share that it has, at a smaller one for most of the time.
-    assert cell(Point(), rl, Options()).method == rl
-    this = cell(Point(), rl, options(tmp_path))
+    assert make_run(Point(), rl, Options()).method == rl
+    this = make_run(Point(), rl, options(tmp_path))
     assert this.scale.interactions == 1024
-    this.episodes(scenarios(Point(), 10, 2))
+    this.run_test(scenarios(Point(), 10, 2))
     summary = this.controller_stage.summary()
     # Six iterations of 128 steps each, and two.
     assert (summary["interactions"], summary["learned_from"]) == (768 + 256, 256)
@@ -78,34 +80,34 @@ def test_its_learning_is_counted_and_not_recorded(rl: methods.Inverse, tmp_path:
 
 
 def test_killed_on_its_way_it_ends_with_the_same_bits(
-    rl: methods.Inverse, tmp_path: Path, monkeypatch
+    rl: methods.InverseDynamics, tmp_path: Path, monkeypatch
 ) -> None:
-    whole = cell(Point(), rl, options(tmp_path / "whole")).experience()
+    whole = make_run(Point(), rl, options(tmp_path / "whole")).experience()
     monkeypatch.setattr(collecting, "CHUNK", 128)
     for calls in (2, 4):  # while it learns, and while it is recorded
-        dying = cell(Point(), rl, options(tmp_path / "killed"))
+        dying = make_run(Point(), rl, options(tmp_path / "killed"))
         with monkeypatch.context() as m:
             m.setattr(Progress, "advance", dies_at(calls))
             with pytest.raises(Killed):
                 dying.experience()
-    killed = cell(Point(), rl, options(tmp_path / "killed")).experience()
+    killed = make_run(Point(), rl, options(tmp_path / "killed")).experience()
     jax.tree.map(np.testing.assert_array_equal, killed, whole)
 
 
 def test_a_record_in_memory_is_not_read_back(
-    rl: methods.Inverse, tmp_path: Path, monkeypatch
+    rl: methods.InverseDynamics, tmp_path: Path, monkeypatch
 ) -> None:
     def refuse(*args) -> None:
         raise AssertionError("read back")
 
     with monkeypatch.context() as m:
         m.setattr(experience, "load_chunks", refuse)
-        made = cell(Point(), rl, options(tmp_path)).experience()
-    read = cell(Point(), rl, options(tmp_path)).experience()  # by another process, later
+        made = make_run(Point(), rl, options(tmp_path)).experience()
+    read = make_run(Point(), rl, options(tmp_path)).experience()  # by another process, later
     same(made, read)
 
 
 def test_a_share_lies_between_0_and_1() -> None:
     for wrong in (0.0, 1.0, -0.5, float("nan")):
-        with pytest.raises(BadInput, match="share"):
+        with pytest.raises(BadInput, match="fraction"):
             Frozen(LEARNER, wrong)

@@ -19,7 +19,7 @@ from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
 from genidm.paper.generalize import Generalize, generalize, replay, residual
 from genidm.paper.pairs import pairs, with_reflection
-from genidm.paper.replaying import Replay
+from genidm.paper.replaying import RotatedReplay
 from genidm.robots import Ant
 from genidm.tasks import WalkForward
 
@@ -27,20 +27,20 @@ KEY = jax.random.key(3)
 H = 7  # steps of a segment; the record's 30 are no multiple
 MODES = ("segments", "episodes", "rotate")
 ROBOT = Point(speed=2.0, falls_at=0.25)
-STEP, PLACE = jax.jit(ROBOT.step), jax.jit(ROBOT.place)
+STEP, PLACE = jax.jit(ROBOT.step), jax.jit(ROBOT.set_state)
 
 
 @functools.cache
 def record(robot: Point = ROBOT) -> Experience:
     """30 steps of 5 lanes that walk at random; episodes end by falls and after 13 steps."""
-    agent = RandomActions(lanes=6, unroll=10)
+    agent = RandomActions(num_envs=6, unroll_length=10)
     out, _ = collect(robot, agent, 180, seed=1, task=WalkForward(13), quiet=True)
     return jax.tree.map(lambda x: x[:, :5], out)
 
 
 @functools.cache
-def turned(mode: str, robot: Point = ROBOT, copies: int = 1) -> Replay:
-    return replay(robot, record(robot), KEY, Generalize(mode, H, copies, lanes=9), quiet=True)
+def turned(mode: str, robot: Point = ROBOT, copies: int = 1) -> RotatedReplay:
+    return replay(robot, record(robot), KEY, Generalize(mode, H, copies, num_envs=9), quiet=True)
 
 
 def close(a, b, atol: float = 1e-5) -> None:
@@ -63,8 +63,8 @@ def test_a_turned_or_mirrored_point_goes_the_turned_or_mirrored_way() -> None:
     before, a, yaw = states(), actions(), jnp.linspace(-3.0, 2.0, 9)
     after = STEP(before, a)
     turn = STEP(PLACE(before.physics, yaw), a)
-    close(turn.position, symmetry.turn_vector(after.position, yaw))
-    close(turn.observation, ROBOT.observation.turn(after.observation, yaw))
+    close(turn.position, symmetry.rotate_vector(after.position, yaw))
+    close(turn.observation, ROBOT.observation.rotate(after.observation, yaw))
     close(symmetry.wrap(turn.heading - after.heading - yaw), 0)
     across = PLACE(ROBOT.mirror_physics(before.physics), 0 * yaw)
     across = STEP(across, ROBOT.action.mirror(a))
@@ -83,60 +83,60 @@ def test_the_record_has_what_these_tests_need() -> None:
     assert not r.last[-1].all()  # an episode that the record's end cuts off
 
 
-@pytest.mark.parametrize("look_ahead", [1, 2, 9, 100])
-def test_the_goal_is_ahead_in_the_same_episode(look_ahead: int) -> None:
+@pytest.mark.parametrize("goal_horizon", [1, 2, 9, 100])
+def test_the_goal_is_ahead_in_the_same_episode(goal_horizon: int) -> None:
     last = np.asarray(record().last)
     expected, there = np.zeros(last.shape, int), np.zeros(last.shape, bool)
     for t, lane in np.ndindex(last.shape):
         goal = t
-        while goal < t + look_ahead - 1 and not last[goal, lane] and goal < len(last) - 1:
+        while goal < t + goal_horizon - 1 and not last[goal, lane] and goal < len(last) - 1:
             goal += 1
-        expected[t, lane], there[t, lane] = goal, goal == t + look_ahead - 1
-    goals, exist = goal_step(jnp.asarray(last), look_ahead)
+        expected[t, lane], there[t, lane] = goal, goal == t + goal_horizon - 1
+    goals, exist = goal_step(jnp.asarray(last), goal_horizon)
     np.testing.assert_array_equal(goals, expected)
     np.testing.assert_array_equal(exist, there)
 
 
-def test_what_ends_before_the_look_ahead_is_left_out() -> None:
+def test_what_ends_before_the_goal_horizon_is_left_out() -> None:
     r = record()
     _, exist = goal_step(jnp.asarray(r.last), 4)
     assert 0 < np.asarray(exist).sum() < r.interactions
-    samples = pairs(ROBOT, r, look_ahead=4)
+    samples = pairs(ROBOT, r, goal_horizon=4)
     close(samples.a, np.asarray(r.a)[np.asarray(exist)])
-    with pytest.raises(BadInput, match="no episode lasts look_ahead = 100 steps"):
-        pairs(ROBOT, r, look_ahead=100)
+    with pytest.raises(BadInput, match="no episode lasts goal_horizon = 100 steps"):
+        pairs(ROBOT, r, goal_horizon=100)
 
 
 def test_a_step_that_is_not_valid_is_no_goal_of_others() -> None:
-    r, look_ahead = record(), 3
+    r, goal_horizon = record(), 3
     valid = np.ones((30, 5), bool)
     valid[[4, 11, 20], [0, 1, 3]] = False
-    goal, exist = map(np.asarray, goal_step(jnp.asarray(r.last), look_ahead))
+    goal, exist = map(np.asarray, goal_step(jnp.asarray(r.last), goal_horizon))
     kept = exist & valid & np.take_along_axis(valid, goal, axis=0)
     assert kept.sum() < (exist & valid).sum()
-    samples = pairs(ROBOT, r.replace(valid=valid), look_ahead=look_ahead)
+    samples = pairs(ROBOT, r.replace(valid=valid), goal_horizon=goal_horizon)
     np.testing.assert_array_equal(samples.a, np.asarray(r.a)[kept])
 
 
-@pytest.mark.parametrize("look_ahead", [1, 4, 9])
+@pytest.mark.parametrize("goal_horizon", [1, 4, 9])
 @pytest.mark.parametrize("mode", MODES)
-def test_directions_point_to_the_goal_in_every_view(mode: str, look_ahead: int) -> None:
+def test_directions_point_to_the_goal_in_every_view(mode: str, goal_horizon: int) -> None:
     r, g = record(), turned(mode)
-    samples = pairs(ROBOT, r, g, look_ahead=look_ahead)
-    goal, exist = map(np.asarray, goal_step(jnp.asarray(r.last), look_ahead))
+    samples = pairs(ROBOT, r, g, goal_horizon=goal_horizon)
+    goal, exist = map(np.asarray, goal_step(jnp.asarray(r.last), goal_horizon))
     expected = np.zeros((2, *r.first.shape, 3))
     for t, lane in np.ndindex(r.first.shape):
         end, yaw = r.o_next[goal[t, lane], lane], g.yaw[0, t, lane]
-        ways = end - r.o[t, lane], np.asarray(symmetry.turn_vector(end, yaw)) - g.o[0, t, lane]
+        ways = end - r.o[t, lane], np.asarray(symmetry.rotate_vector(end, yaw)) - g.o[0, t, lane]
         expected[:, t, lane] = [way / np.linalg.norm(way) for way in ways]
     close(samples.d, expected[:, exist], atol=1e-4)
 
 
-def test_at_look_ahead_1_the_goal_of_a_copy_is_its_own_next_position() -> None:
+def test_at_goal_horizon_1_the_goal_of_a_copy_is_its_own_next_position() -> None:
     r, g = record(), turned("segments")
     moved = g.replace(o_next=g.o_next + np.float32([0, 0, 1]))
     way = moved.o_next - moved.o
-    samples = pairs(ROBOT, r, moved, look_ahead=1)
+    samples = pairs(ROBOT, r, moved, goal_horizon=1)
     close(samples.d[1], (way / np.linalg.norm(way, axis=-1, keepdims=True)).reshape(-1, 3))
 
 
@@ -150,8 +150,8 @@ def test_where_physics_is_exact_so_is_the_replay(mode: str) -> None:
     longest = {"segments": H, "episodes": 13, "rotate": 1}[mode]
     assert off["step"].tolist() == list(range(1, longest + 1))
     assert off["p90"].max() < 1e-5
-    close(g.s[0], ROBOT.observation.turn(jnp.asarray(r.s), jnp.asarray(g.yaw[0])))
-    close(g.o[0], symmetry.turn_vector(jnp.asarray(r.o), jnp.asarray(g.yaw[0])))
+    close(g.s[0], ROBOT.observation.rotate(jnp.asarray(r.s), jnp.asarray(g.yaw[0])))
+    close(g.o[0], symmetry.rotate_vector(jnp.asarray(r.o), jnp.asarray(g.yaw[0])))
     assert np.asarray(g.valid).all()
 
 
@@ -163,14 +163,14 @@ def test_the_residual_tells_of_a_robot_that_is_not_equivalent() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("look_ahead", [1, 6])
-def test_the_views_of_a_sample_are_one_sample_turned(mode: str, look_ahead: int) -> None:
-    samples = pairs(ROBOT, record(), turned(mode), look_ahead=look_ahead)
+@pytest.mark.parametrize("goal_horizon", [1, 6])
+def test_the_views_of_a_sample_are_one_sample_turned(mode: str, goal_horizon: int) -> None:
+    samples = pairs(ROBOT, record(), turned(mode), goal_horizon=goal_horizon)
     s, d = in_frame(ROBOT, "heading", jnp.asarray(samples.s), jnp.asarray(samples.d))
     close(s[0], s[1], atol=1e-4)
     close(d[0], d[1], atol=1e-4)
     assert np.abs(samples.d[0] - samples.d[1]).max() > 1
-    _, exist = goal_step(jnp.asarray(record().last), look_ahead)
+    _, exist = goal_step(jnp.asarray(record().last), goal_horizon)
     np.testing.assert_array_equal(samples.a, record().a[np.asarray(exist)])
 
 
@@ -193,7 +193,7 @@ def test_every_copy_is_turned_by_yaws_of_its_own() -> None:
     g = turned("segments", copies=3)
     assert g.yaw.shape == (3, 30, 5) and len(np.unique(g.yaw[:, 0])) == 15
     assert np.abs(g.yaw).max() <= np.pi and g.yaw.min() < -2 and g.yaw.max() > 2
-    samples = pairs(ROBOT, record(), g, look_ahead=1)
+    samples = pairs(ROBOT, record(), g, goal_horizon=1)
     assert samples.s.shape == (4, 150, 10) and samples.d.shape == (4, 150, 3)
     assert residual(record(), g)["p90"].max() < 1e-5
 
@@ -204,7 +204,7 @@ def test_the_replay_does_not_depend_on_blocks_or_devices(
     mode: str, segment: int, lanes: int, cores: int
 ) -> None:
     mesh = devices.mesh(jax.devices()[:cores])
-    settings = Generalize(mode, segment, lanes=lanes)
+    settings = Generalize(mode, segment, num_envs=lanes)
     other, this = replay(ROBOT, record(), KEY, settings, mesh=mesh, quiet=True), turned(mode)
     np.testing.assert_array_equal(other.yaw, this.yaw)
     jax.tree.map(functools.partial(close, atol=1e-6), other, this)
@@ -223,8 +223,8 @@ def test_exact_turns_are_by_any_yaw() -> None:
 
 def test_generalize_is_replay_and_pairs_and_residual_in_one() -> None:
     settings = Generalize("rotate", copies=2)
-    samples, off = generalize(ROBOT, record(), KEY, settings, look_ahead=5, mirror=True)
-    expected = pairs(ROBOT, record(), turned("rotate", copies=2), look_ahead=5, mirror=True)
+    samples, off = generalize(ROBOT, record(), KEY, settings, goal_horizon=5, mirror=True)
+    expected = pairs(ROBOT, record(), turned("rotate", copies=2), goal_horizon=5, mirror=True)
     jax.tree.map(np.testing.assert_array_equal, samples, expected)
     assert off["step"].tolist() == [1]
 
@@ -239,7 +239,7 @@ def test_samples_of_diverged_physics_are_dropped() -> None:
     assert lost.any() and np.asarray(r.last)[lost].all()
     for x in jax.tree.leaves((r, g)):
         assert np.isfinite(x).all()
-    samples = pairs(robot, r, g, look_ahead=1)
+    samples = pairs(robot, r, g, goal_horizon=1)
     kept = np.asarray(r.valid & g.valid[0])
     assert kept.sum() == samples.a.shape[0] < r.interactions
     np.testing.assert_array_equal(samples.a, r.a[kept])
@@ -255,7 +255,7 @@ def test_a_replay_that_diverges_is_followed_no_further() -> None:
     lost = np.asarray(~g.valid[0])
     onward = ~np.asarray(r.first[1:])
     assert lost.any() and (lost[1:] >= lost[:-1])[onward].all()
-    samples, exact = (pairs(ROBOT, r, x, look_ahead=5) for x in (g, whole))
+    samples, exact = (pairs(ROBOT, r, x, goal_horizon=5) for x in (g, whole))
     exist = np.asarray(goal_step(jnp.asarray(r.last), 5)[1])
     close(samples.d[1], exact.d[1][~lost[exist]], atol=1e-4)
     assert samples.a.shape[0] == (exist & ~lost).sum()
@@ -264,11 +264,11 @@ def test_a_replay_that_diverges_is_followed_no_further() -> None:
 def test_a_sample_without_a_direction_is_dropped_and_none_at_all_is_refused() -> None:
     r = record()
     still = r.replace(o_next=np.where(np.arange(30)[:, None, None] < 2, r.o, r.o_next))
-    assert pairs(ROBOT, still, look_ahead=1).a.shape[0] == 28 * 5
+    assert pairs(ROBOT, still, goal_horizon=1).a.shape[0] == 28 * 5
     with pytest.raises(BadInput, match="no sample"):
-        pairs(ROBOT, r.replace(o_next=r.o), look_ahead=1)
+        pairs(ROBOT, r.replace(o_next=r.o), goal_horizon=1)
     with pytest.raises(BadInput, match="no step is valid"):
-        pairs(ROBOT, r.replace(valid=np.zeros((30, 5), bool)), look_ahead=1)
+        pairs(ROBOT, r.replace(valid=np.zeros((30, 5), bool)), goal_horizon=1)
 
 
 def test_a_replay_that_is_lost_whole_has_no_residual() -> None:
@@ -279,7 +279,7 @@ def test_a_replay_that_is_lost_whole_has_no_residual() -> None:
 
 def test_mirrored_samples_are_samples_of_the_mirrored_robot() -> None:
     r = record()
-    samples = pairs(ROBOT, r, turned("segments"), look_ahead=1, mirror=True)
+    samples = pairs(ROBOT, r, turned("segments"), goal_horizon=1, mirror=True)
     assert samples.s.shape == (2, 300, 10) and samples.a.shape == (300, 3)
     a, across = np.split(samples.a, 2)
     np.testing.assert_array_equal(across, a * [1, -1, -1])
@@ -352,15 +352,15 @@ def test_a_record_with_nan_or_odd_shapes_is_refused(tmp_path: Path, wrong: dict,
         save_and_load(bad, tmp_path / "bad")
 
 
-@pytest.mark.parametrize("wrong", [{"segment": 0}, {"copies": 0}, {"lanes": 0}])
+@pytest.mark.parametrize("wrong", [{"segment": 0}, {"copies": 0}, {"num_envs": 0}])
 def test_settings_that_make_no_replay_are_refused(wrong: dict) -> None:
     with pytest.raises(BadInput, match="at least 1"):
         Generalize(**wrong)
 
 
-def test_a_look_ahead_below_1_is_refused() -> None:
-    with pytest.raises(BadInput, match="look_ahead"):
-        pairs(ROBOT, record(), look_ahead=0)
+def test_a_goal_horizon_below_1_is_refused() -> None:
+    with pytest.raises(BadInput, match="goal_horizon"):
+        pairs(ROBOT, record(), goal_horizon=0)
 
 
 # ── the Ant ─────────────────────────────────────────────────────────────────────────────
@@ -379,7 +379,7 @@ def test_after_20_steps_a_replayed_ant_is_within_a_centimetre(ant: Ant) -> None:
     )  # fmt: skip
     g = replay(ant, log, KEY, Generalize(segment=20, copies=2), quiet=True)
     one, other = (jax.tree.map(lambda x, c=c: x[c : c + 1], g.replace(start=None)) for c in (0, 1))
-    back = symmetry.turn_vector(jnp.asarray(one.o_next[0]), -jnp.asarray(one.yaw[0]))
+    back = symmetry.rotate_vector(jnp.asarray(one.o_next[0]), -jnp.asarray(one.yaw[0]))
     off = residual(log.replace(o_next=np.asarray(back)), other.replace(start=g.start))
     assert off["step"].tolist() == list(range(1, 21))
     assert off["median"][0] < 1e-4 and off["median"][-1] < 1e-2

@@ -24,12 +24,12 @@ from genidm.agents.random import RandomActions
 from genidm.paper import methods
 from genidm.runs import cell as cell_module
 from genidm.runs import run as stages
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 CALL = {"minutes": 1, "environment": {"versions": {}, "hardware": "a machine", "commit": None}}
 
 
-def reported(this, bank, options) -> Path:
+def reported(this, scenarios, options) -> Path:
     """Stands for a report, whose figures take longer than all else."""
     place = this.root / f"report-{this.scale.name}"
     place.mkdir(exist_ok=True)
@@ -175,7 +175,7 @@ def run(monkeypatch, tmp_path: Path, *flags: str) -> int:
         sys, "argv", ["gpu", *places, "--robots", "point", "--scale", "0.25", *flags]
     )
     try:
-        guarded(command.gpu, "")
+        run_cli(command.gpu, "")
     except SystemExit as end:
         return int(end.code or 0)
     return 0
@@ -207,7 +207,7 @@ def test_a_cell_that_fails_is_written_down_and_the_rest_goes_on(
     monkeypatch, tmp_path, started
 ) -> None:
     with monkeypatch.context() as m:
-        m.setattr(cells, "run_cell", lambda *args: 1 / 0)
+        m.setattr(cells, "run_method", lambda *args: 1 / 0)
         m.setattr(stages, "replay", lambda *args: 1 / 0)
         assert run(m, tmp_path, "--methods", "LR", "HF") == 1
     found = section(tmp_path)
@@ -219,7 +219,7 @@ def test_a_cell_that_fails_is_written_down_and_the_rest_goes_on(
     assert len(found["speeds"]) == 2 and [x["method"] for x in found["cells"]] == ["HF"]
     assert found["calls"][0]["ended"] == "done: point HF; point LR is 𝒢"
     assert "ZeroDivisionError" in (tmp_path / "results" / "gpu.md").read_text()
-    monkeypatch.setattr(cells, "run_cell", lambda *args: tmp_path)
+    monkeypatch.setattr(cells, "run_method", lambda *args: tmp_path)
     (tmp_path / "table.txt").write_text("the table")
     assert run(monkeypatch, tmp_path, "--methods", "LR", "HF") == 0
     found = section(tmp_path)

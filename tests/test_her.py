@@ -14,53 +14,66 @@ from one_step import advance, split
 from point import Point, Straight
 
 from genidm import devices
-from genidm.agents.buffer import Buffer, Index, draw, empty, insert, remember, steps_left
+from genidm.agents.buffer import (
+    Buffer,
+    Index,
+    add,
+    empty,
+    sample_index,
+    steps_left,
+    to_replay_transition,
+)
 from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER, Strategy
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
 from genidm.tasks import (
     Dense,
+    EnvState,
     GoToGoal,
-    Lanes,
-    Progress,
+    ProgressReward,
     Sparse,
-    Step,
+    Transition,
     WalkForward,
+    bootstrapped_reward,
     inputs,
-    outlook,
 )
 
 # It arrives, it falls, and it runs into the time limit.
 ROBOT = Point(speed=4.0, falls_at=3.0)
-TASK = GoToGoal(reward=Dense(), episode_steps=25, reach=0.3)
+TASK = GoToGoal(reward=Dense(), episode_steps=25, goal_radius=0.3)
 LANES, UNROLL, ROWS, STEPS = 12, 10, 40, 110
 DRAWN = 6000
 AGENT = SAC(
-    lanes=LANES, unroll=UNROLL, batch=DRAWN, capacity=ROWS * LANES, warmup=0, her=HER("episode")
+    num_envs=LANES,
+    unroll_length=UNROLL,
+    batch_size=DRAWN,
+    max_replay_size=ROWS * LANES,
+    min_replay_size=0,
+    her=HER("episode"),
 )
 
 
 @functools.cache
-def walked() -> tuple[Step, Buffer]:
+def walked() -> tuple[Transition, Buffer]:
     """Steps `[STEPS, LANES]`, in NumPy, and a buffer that remembers the newest ROWS of them."""
 
-    def step(lanes: Lanes, _: None) -> tuple[Lanes, Step]:
+    def step(lanes: EnvState, _: None) -> tuple[EnvState, Transition]:
         lanes, keys = split(lanes)
-        straight = Straight(jnp.float32(0.9), ROBOT)(lanes.robots.observation, lanes.displacement)
+        straight = Straight(jnp.float32(0.9), ROBOT)(lanes.robots.observation, lanes.relative_goal)
         anywhere = jax.vmap(lambda k: jax.random.uniform(k, (3,), minval=-1.0))(keys)
         to_goal = jnp.arange(LANES)[:, None] % 2 == 0
         return advance(TASK, ROBOT, lanes, jnp.where(to_goal, straight, anywhere))
 
-    def walk(keys: jax.Array) -> tuple[Step, Any]:
+    def walk(keys: jax.Array) -> tuple[Transition, Any]:
         _, steps = jax.lax.scan(step, TASK.start(ROBOT, keys), length=STEPS)
-        return steps, jax.vmap(functools.partial(remember, ROBOT))(steps)
+        return steps, jax.vmap(functools.partial(to_replay_transition, ROBOT))(steps)
 
     steps, memory = jax.jit(walk)(jax.random.split(jax.random.key(0), LANES))
     parts = [
         jax.tree.map(lambda x, n=n: x[n : n + UNROLL], memory) for n in range(0, STEPS, UNROLL)
     ]
-    buffer, fill = empty(parts[0], AGENT.capacity), jax.jit(insert)
+    buffer, fill = empty(parts[0], AGENT.max_replay_size), jax.jit(add)
     for part in parts:
         buffer = fill(buffer, part)
     return jax.tree.map(np.asarray, steps), buffer
@@ -78,7 +91,7 @@ def window(strategy: Strategy, n: int, lane: int) -> tuple[int, int]:
     """First and last step whose outcome may be the goal of step n."""
     steps, _ = walked()
     begun = end = n
-    while steps.age[begun, lane] > 0 and begun > OLDEST:
+    while steps.episode_step[begun, lane] > 0 and begun > OLDEST:
         begun -= 1
     while not steps.last[end, lane] and end < STEPS - 1:
         end += 1
@@ -93,7 +106,7 @@ def goals(her: HER) -> tuple[Index, np.ndarray]:
     @jax.jit
     def given(buffer: Buffer, key: jax.Array) -> tuple[Index, jax.Array]:
         which, what = jax.random.split(key)
-        at = draw(buffer, which, DRAWN)
+        at = sample_index(buffer, which, DRAWN)
         return at, her.goal(buffer, steps_left(buffer), at, what, ROBOT.standing_height)
 
     return jax.tree.map(np.asarray, given(buffer, jax.random.key(1)))
@@ -135,10 +148,10 @@ def test_every_moment_of_the_window_is_as_likely_as_any(strategy: Strategy) -> N
         assert abs(hits.sum() - chance.sum()) <= 4 * np.sqrt((chance * (1 - chance)).sum())
 
 
-@pytest.mark.parametrize("her", [HER(), HER(goals=1)])
+@pytest.mark.parametrize("her", [HER(), HER(n_sampled_goal=1)])
 def test_of_so_many_goals_one_is_the_steps_own(her: HER) -> None:
     *_, own = relabelled(her)
-    share = 1 / (her.goals + 1)
+    share = 1 / (her.n_sampled_goal + 1)
     assert abs(own - share * DRAWN) < 4 * np.sqrt(DRAWN * share * (1 - share))
 
 
@@ -151,11 +164,11 @@ def test_new_goals_are_as_high_as_the_tasks(strategy: Strategy) -> None:
 # ── what a step is worth for its new goal ───────────────────────────────────────────────
 
 
-REWARDS = {"progress": Progress(), "sparse": Sparse(), "dense": Dense()}
+REWARDS = {"progress": ProgressReward(), "sparse": Sparse(), "dense": Dense()}
 
 
 @functools.cache
-def sampled(agent: SAC, task: GoToGoal) -> tuple[Any, Step, Step]:
+def sampled(agent: SAC, task: GoToGoal) -> tuple[Any, Transition, Transition]:
     """A minibatch, the steps that it was made of, and the same steps made for its goals."""
     steps, buffer = walked()
     sample = jax.jit(functools.partial(agent.sample, ROBOT, task))
@@ -167,8 +180,8 @@ def sampled(agent: SAC, task: GoToGoal) -> tuple[Any, Step, Step]:
     at = tuple(np.array([where[a.tobytes()] for a in np.asarray(batch.action)]).T)
     were = jax.tree.map(lambda x: jnp.asarray(x[at]), steps)
     goal = batch.observation[:, ROBOT.observation.size :] + were.before.position
-    keys = jax.random.split(jax.random.key(3), agent.batch)
-    lanes = Lanes(were.before, were.age, keys, goal)
+    keys = jax.random.split(jax.random.key(3), agent.batch_size)
+    lanes = EnvState(were.before, were.episode_step, keys, goal)
     _, anew = jax.jit(functools.partial(advance, task, ROBOT))(lanes, were.action)
     return jax.tree.map(np.asarray, (batch, were, anew))
 
@@ -182,7 +195,9 @@ def test_a_relabelled_step_is_worth_what_it_would_have_been(name: str) -> None:
     task = dataclasses.replace(TASK, reward=REWARDS[name])
     batch, were, anew = sampled(AGENT, task)
     np.testing.assert_array_equal(batch.discount, 1.0 - anew.terminal)
-    np.testing.assert_allclose(batch.reward, outlook(anew, AGENT.discount), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        batch.reward, bootstrapped_reward(anew, AGENT.discounting), rtol=1e-5, atol=1e-4
+    )
     before = inputs(were.before.observation, anew.goal - were.before.position)
     np.testing.assert_allclose(batch.observation, before, rtol=0, atol=1e-6)
     # Where the episode went on, what is bootstrapped from is what the step led to.
@@ -206,7 +221,9 @@ def test_the_minibatch_has_what_these_tests_need() -> None:
 def test_without_hindsight_goals_and_rewards_are_the_tasks_own() -> None:
     batch, were, anew = sampled(dataclasses.replace(AGENT, her=None), TASK)
     np.testing.assert_allclose(anew.goal, were.goal, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(batch.reward, outlook(were, AGENT.discount), rtol=1e-6)
+    np.testing.assert_allclose(
+        batch.reward, bootstrapped_reward(were, AGENT.discounting), rtol=1e-6
+    )
     np.testing.assert_array_equal(batch.discount, 1.0 - were.terminal)
     own = were.last & ~were.terminal
     np.testing.assert_array_equal(batch.extras["state_extras"]["truncation"], own)
@@ -216,7 +233,7 @@ def test_what_diverged_is_remembered_as_a_fall() -> None:
     steps, _ = walked()
     fell, lost = steps.after.fallen, np.arange(LANES) % 3 == np.arange(STEPS)[:, None] % 3
     after = dataclasses.replace(steps.after, diverged=lost)
-    memory = remember(ROBOT, dataclasses.replace(steps, after=after))
+    memory = to_replay_transition(ROBOT, dataclasses.replace(steps, after=after))
     np.testing.assert_array_equal(memory.fallen, fell | lost)
     assert (fell & ~lost).any() and (lost & ~fell).any()
 
@@ -226,8 +243,8 @@ def test_what_diverged_is_remembered_as_a_fall() -> None:
 
 @pytest.mark.parametrize("number", [0, -1])
 def test_no_goals_are_refused(number: int) -> None:
-    with pytest.raises(BadInput, match="goals must be at least 1"):
-        HER(goals=number)
+    with pytest.raises(BadInput, match="n_sampled_goal must be at least 1"):
+        HER(n_sampled_goal=number)
 
 
 @pytest.mark.parametrize("learner", [SAC, DDPG])

@@ -92,7 +92,7 @@ def test_next_state_is_that_of_c(starts: Physics, one_step: tuple[Any, ...]) -> 
     actions, after, contact = one_step
     with jax.enable_x64(True):
         robot = Humanoid()
-        state = jax.jit(robot.step)(robot.place(starts, jnp.zeros(LANES)), jnp.asarray(actions))
+        state = jax.jit(robot.step)(robot.set_state(starts, jnp.zeros(LANES)), jnp.asarray(actions))
         got, observation = positive_w(state.physics), np.asarray(state.observation)
     expected = observed_in_c(after, contact)
     assert_close(got.qpos, after.qpos, atol=1e-5)
@@ -125,7 +125,7 @@ def test_yaw_commutes_with_physics(
     humanoid: Humanoid, starts: Physics, episode: tuple[Any, ...]
 ) -> None:
     yaw = np.linspace(-3, 3, LANES)
-    assert_commutes(humanoid, observed_in_c, starts, episode, lambda part, x: part.turn(x, yaw))
+    assert_commutes(humanoid, observed_in_c, starts, episode, lambda part, x: part.rotate(x, yaw))
 
 
 def test_mirror_commutes_with_physics(
@@ -137,16 +137,16 @@ def test_mirror_commutes_with_physics(
 def test_world_frame_turns_the_velocity(starts: Physics) -> None:
     robot, yaw = HumanoidWorld(), np.linspace(-3, 3, LANES).astype(np.float32)
     state = placed(robot, starts)
-    turned = robot.place(state.physics, jnp.asarray(yaw))
-    got = robot.observation.turn(state.observation, yaw)
+    turned = robot.set_state(state.physics, jnp.asarray(yaw))
+    got = robot.observation.rotate(state.observation, yaw)
     assert_close(turned.observation, got, atol=5e-6)
     assert np.abs(turned.observation[:, 1:3] - state.observation[:, 1:3]).max() > 0.1
 
 
 def test_a_record_is_read_as_the_world_has_it(humanoid: Humanoid, starts: Physics) -> None:
     yaw = jnp.linspace(-3, 3, LANES)
-    turned = humanoid.place(starts, yaw)
-    expected = HumanoidWorld().place(starts, yaw).observation
+    turned = humanoid.set_state(starts, yaw)
+    expected = HumanoidWorld().set_state(starts, yaw).observation
     assert_close(in_world(turned.observation), expected, atol=5e-6)
     assert np.abs(turned.observation - expected).max() > 0.1
 

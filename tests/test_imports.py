@@ -16,7 +16,7 @@ PACKAGE = Path(genidm.__file__).parent
 # Modules on one line know nothing of each other.
 ORDER = """
 errors evaluation.episodes quiet paper.protocol
-checks devices registry trees
+checks devices registry trees renamed
 symmetry
 evaluation paper runs
 config
@@ -35,7 +35,7 @@ rollout tasks
 experience
 agents.policy agents.buffer
 agents.base agents.her
-agents.alternating agents.walking agents.remembering
+agents.rollout_then_learn agents.unroll agents.remembering
 agents.off_policy
 agents.*
 agents.frozen
@@ -53,7 +53,7 @@ evaluation.invariance evaluation.waypoints
 evaluation.stats evaluation.sanity
 report.rows
 report.table report.drawing
-report.figures report.journeys
+report.figures report.waypoint_figure
 report
 paper.methods
 runs.scale
@@ -61,8 +61,8 @@ runs.resolve runs.run
 report.runs
 report.shown
 report.write
-video.filming video.scenery video.backends video.clip
-video.shooting video.pages
+video.clips video.scenery video.backends video.encoding
+video.rendering video.pages
 video
 runs.cell
 runs.command

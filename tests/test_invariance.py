@@ -20,8 +20,8 @@ from genidm.robots import Ant, Robot
 class Pusher(flax.struct.PyTreeNode):
     """Pushes along the world's axes towards the goal: wherever it faces, it does the same."""
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        return displacement
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        return relative_goal
 
 
 def states(robot: Robot, count: int, seed: int = 0) -> np.ndarray:
@@ -44,22 +44,22 @@ def record(robot: Robot, steps: int = 50, lanes: int = 40) -> Experience:
     return Experience(s, o, o, np.zeros((*shape, robot.action.size)), no, no, ~no)
 
 
-def untrained(robot: Robot, frame) -> Controller:
+def untrained(robot: Robot, input_frame) -> Controller:
     """An IDM that has learned nothing; normalised by states that it may see."""
     s = np.asarray(states(robot, 500, seed=2))[None]
     d = np.tile(np.float32([1, 0, 0]), (1, 500, 1))
     samples = Pairs(s, d, np.zeros((500, robot.action.size), np.float32))
-    learner, _ = training(robot, samples, jax.random.key(0), Fit(idm=(32,)), frame)
+    learner, _ = training(robot, samples, jax.random.key(0), Fit(idm=(32,)), input_frame)
     return learner.model
 
 
 def test_a_controller_in_the_worlds_frame_changes_by_the_chord() -> None:
     """‖R d − d‖ = 2 sin(θ/2) of the horizontal part of d, whatever the state."""
     robot = Point()
-    s, displacement = probes(robot, record(robot))
-    changes = invariance(robot, Pusher(), s, displacement, ANGLES)
+    s, relative_goal = probes(robot, record(robot))
+    changes = invariance(robot, Pusher(), s, relative_goal, ANGLES)
     assert changes.shape == (13, 1000)
-    level = np.linalg.norm(displacement[:, :2], axis=-1)
+    level = np.linalg.norm(relative_goal[:, :2], axis=-1)
     expected = 2 * np.sin(ANGLES / 2)[:, None] * level
     np.testing.assert_allclose(changes, expected, atol=1e-5)
 
@@ -83,16 +83,16 @@ def test_the_heading_frame_is_invariant_to_float_noise_and_the_worlds_is_not(rob
 def test_probes_are_states_of_the_record_with_goals_as_in_the_test() -> None:
     robot = Point()
     there = record(robot)
-    s, displacement = probes(robot, there)
-    assert s.shape == (1000, robot.observation.size) and displacement.shape == (1000, 3)
+    s, relative_goal = probes(robot, there)
+    assert s.shape == (1000, robot.observation.size) and relative_goal.shape == (1000, 3)
     at = {row.tobytes(): i for i, row in enumerate(there.s.reshape(2000, -1))}
     drawn = [at[np.asarray(x).tobytes()] for x in s]
     assert len(set(drawn)) == 1000, "none is drawn twice"
     o = there.o.reshape(2000, 3)[drawn]
-    level = np.linalg.norm(displacement[:, :2], axis=-1)
+    level = np.linalg.norm(relative_goal[:, :2], axis=-1)
     np.testing.assert_allclose(level, 3.0, rtol=1e-5)
-    np.testing.assert_allclose(displacement[:, 2], robot.standing_height - o[:, 2], atol=1e-6)
-    angle = np.arctan2(displacement[:, 1], displacement[:, 0]) - robot.observation.yaw(s)
+    np.testing.assert_allclose(relative_goal[:, 2], robot.standing_height - o[:, 2], atol=1e-6)
+    angle = np.arctan2(relative_goal[:, 1], relative_goal[:, 0]) - robot.observation.yaw(s)
     bearing = (angle + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(bearing).max() <= np.pi / 4 + 1e-5
     assert bearing.max() > 0.7 and bearing.min() < -0.7
@@ -102,8 +102,8 @@ def test_probes_leave_out_what_diverged_and_are_no_more_than_there_are() -> None
     robot, there = Point(), record(Point())
     valid = np.zeros(there.valid.shape, bool)
     valid[7, 3:9] = True
-    s, displacement = probes(robot, there.replace(valid=valid))
-    assert displacement.shape == (6, 3)
+    s, relative_goal = probes(robot, there.replace(valid=valid))
+    assert relative_goal.shape == (6, 3)
     np.testing.assert_array_equal(np.asarray(s), there.s[7, 3:9])
 
 
@@ -111,8 +111,8 @@ def test_a_goal_is_no_farther_than_the_robots_test_has_them() -> None:
     class Near(Point):
         target_distance = (1.5, 2.5)
 
-    _, displacement = probes(Near(), record(Point()))
-    np.testing.assert_allclose(np.linalg.norm(displacement[:, :2], axis=-1), 2.5, rtol=1e-5)
+    _, relative_goal = probes(Near(), record(Point()))
+    np.testing.assert_allclose(np.linalg.norm(relative_goal[:, :2], axis=-1), 2.5, rtol=1e-5)
 
 
 def test_probes_are_the_same_every_time_and_others_with_another_seed() -> None:

@@ -28,7 +28,7 @@ from small_cells import LR, VGCP, Finished, arrays, counted, options, stage_of
 
 from genidm.agents import collect as collecting
 from genidm.progress import Progress
-from genidm.runs.cell import run_cell
+from genidm.runs.cell import run_method
 from genidm.store import Stage
 
 ROOT = Path(__file__).parents[1]
@@ -48,9 +48,9 @@ def test_killed_on_its_way_it_ends_with_the_same_bits(
         with monkeypatch.context() as m:
             m.setattr(owner, name, death)
             with pytest.raises(Killed):
-                run_cell(Point(), VGCP, options(tmp_path))
+                run_method(Point(), VGCP, options(tmp_path))
     with counted() as calls:
-        run_cell(Point(), VGCP, options(tmp_path))
+        run_method(Point(), VGCP, options(tmp_path))
     assert calls == Counter(run=1)
     for stage in ("VGCP", "test-VGCP"):
         whole, killed = (arrays(stage_of(out, stage)) for out in (direct.out, tmp_path))
@@ -117,7 +117,7 @@ def run_killed(out: Path, points: list[str]) -> None:
             collecting.CHUNK = 2 * 16 * 8
             if point:
                 arm(*point.split(":"))
-            run_cell(Point(), LR, options(out))
+            run_method(Point(), LR, options(out))
             os._exit(0)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if point:
@@ -154,7 +154,7 @@ def arm(where: str, when: str) -> None:
 
 ANT = (
     *("-m", "experiments.ant_lr", "--scale", "0.002", "--episodes", "10"),
-    *("--method.look-ahead", "5", "--test.max-steps", "200"),
+    *("--method.goal-horizon", "5", "--test.max-steps", "200"),
 )
 
 
@@ -162,7 +162,7 @@ ANT = (
 def test_an_ant_killed_from_outside_in_every_stage_ends_with_the_same_bits(tmp_path: Path) -> None:
     env = {**os.environ, "GENIDM_CHECKPOINT_SECONDS": "0", "GENIDM_DEVICES": "2"}
     whole, killed = (
-        [sys.executable, *ANT, "--out", str(tmp_path / n)] for n in ("whole", "killed")
+        [sys.executable, *ANT, "--run-dir", str(tmp_path / n)] for n in ("whole", "killed")
     )
     subprocess.run(whole, env=env, cwd=ROOT, check=True, capture_output=True)
     root = tmp_path / "killed" / "ant"

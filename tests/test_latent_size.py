@@ -21,14 +21,16 @@ from genidm.errors import BadInput
 from genidm.paper import methods
 from genidm.report.runs import find
 from genidm.runs import run as stages
-from genidm.runs.cell import bank_of, cell
-from genidm.runs.command import guarded
+from genidm.runs.cell import make_run, scenarios_of
+from genidm.runs.command import run_cli
 
 LR = tiny(methods.LR, agent=AGENTS[RandomActions])
 
 
 def options(out: Path, **changes) -> Sweep:
-    this = Sweep(scale="0.25", out=out / "runs", episodes=2, sizes=(10, 3), repeats=2, test=TEST)
+    this = Sweep(
+        scale="0.25", run_dir=out / "runs", episodes=2, sizes=(10, 3), repeats=2, test=TEST
+    )
     return dataclasses.replace(this, **changes)
 
 
@@ -61,10 +63,10 @@ def test_all_fits_learn_from_one_experience_and_one_replay(finished: Path) -> No
 
 
 def test_the_first_fit_of_the_own_k_is_that_of_table_1(finished: Path) -> None:
-    own = cell(Point(), LR, options(finished)).controller_stage
+    own = make_run(Point(), LR, options(finished)).controller_stage
     assert own.done
     config = files.load_json(own.path("config.json"))["config"]
-    assert config.keys() == {"source", "share", "look_ahead", "mirror", "frame", "fit"}
+    assert config.keys() == {"source", "fraction", "goal_horizon", "mirror", "input_frame", "fit"}
     first, second = cells(Point(), LR, options(finished))[10]
     assert first.controller_stage.directory == own.directory != second.controller_stage.directory
     again = files.load_json(second.controller_stage.path("config.json"))["config"]
@@ -90,7 +92,7 @@ def test_the_document_holds_what_was_tested(finished: Path) -> None:
     for k, these in cells(Point(), LR, options(finished)).items():
         point, closest = written["sizes"][str(k)], []
         for this in these:
-            stage = this.episodes(bank_of(this, options(finished)), KIND)
+            stage = this.run_test(scenarios_of(this, options(finished)), KIND)
             tree, _ = files.load_arrays(stage.path("episodes"))
             closest.append(tree["episodes"]["closest"].astype(float))
         assert point["means"] == pytest.approx([c.mean() for c in closest], abs=1e-6)
@@ -110,9 +112,9 @@ def test_the_text_tells_what_is_over_fits_and_what_over_seeds(finished: Path) ->
 
 
 def test_no_fit_of_the_figure_is_a_row_of_the_table(finished: Path) -> None:
-    this = cell(Point(), LR, options(finished))
-    bank = bank_of(this, options(finished))
-    assert not find(Point(), this.root, bank, this.scale.name, TEST).found
+    this = make_run(Point(), LR, options(finished))
+    scenarios = scenarios_of(this, options(finished))
+    assert not find(Point(), this.root, scenarios, this.scale.name, TEST).found
 
 
 def test_a_second_run_only_draws_and_writes_where_it_is_told(finished: Path, monkeypatch) -> None:
@@ -121,7 +123,7 @@ def test_a_second_run_only_draws_and_writes_where_it_is_told(finished: Path, mon
 
     for name in ("collect", "replay", "fit", "run"):
         monkeypatch.setattr(stages, name, never)
-    run(Point(), LR, options(finished, results=finished / "results"))
+    run(Point(), LR, options(finished, report_dir=finished / "results"))
     names = {path.name for path in (finished / "results").iterdir()}
     assert names == {"point_latent_size.json", "point_latent_size.png"}
     written = (finished / "results" / "point_latent_size.json").read_text()
@@ -131,10 +133,10 @@ def test_a_second_run_only_draws_and_writes_where_it_is_told(finished: Path, mon
 @pytest.mark.parametrize("flags", [("--sizes", "0", "3"), ("--repeats", "0"), ("--robot", "cow")])
 def test_bad_input_ends_in_a_sentence(tmp_path, monkeypatch, capsys, flags) -> None:
     monkeypatch.setitem(robots.ROBOTS, "point", Point)
-    line = ["latent_size", "--robot", "point", "--out", str(tmp_path), *flags]
+    line = ["latent_size", "--robot", "point", "--run-dir", str(tmp_path), *flags]
     monkeypatch.setattr(sys, "argv", line)
     with pytest.raises(SystemExit) as end:
-        guarded(latent_size.latent_size, "")
+        run_cli(latent_size.latent_size, "")
     assert end.value.code == 2 and capsys.readouterr().err.startswith("error: ")
     assert not list(tmp_path.iterdir())
 

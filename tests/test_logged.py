@@ -25,7 +25,7 @@ from genidm.symmetry import Layout
 
 class Mine(Logged):
     name = "mine"
-    control_step = 0.02
+    dt = 0.02
     standing_height = 0.4
     observation = Layout((symmetry.quaternion("orientation"), symmetry.vector("velocity", "m/s")))
     action = Layout((symmetry.joints("torque", [1, 0], [1, 1], "of full torque"),))
@@ -53,7 +53,7 @@ def log(steps: int = 60, lanes: int = 3) -> Experience:
 
 def test_a_log_becomes_a_controller(tmp_path: Path) -> None:
     robot, rotate = Mine(), Generalize(mode="rotate")
-    pairs, residual = generalize(robot, log(), jax.random.key(0), rotate, look_ahead=20)
+    pairs, residual = generalize(robot, log(), jax.random.key(0), rotate, goal_horizon=20)
     assert residual["median"].max() < 1e-6
     model = fit(robot, pairs, jax.random.key(1), tiny(LR).fit, quiet=True)
     model.save(tmp_path / "run" / "controller")
@@ -67,25 +67,25 @@ def test_a_log_becomes_a_controller(tmp_path: Path) -> None:
         controller.load(tmp_path / "run")
 
 
-def test_a_look_ahead_that_leaves_little_is_said() -> None:
-    with pytest.warns(UserWarning, match="look_ahead 50 leaves 33 of 180 steps"):
-        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), look_ahead=50)
+def test_a_goal_horizon_that_leaves_little_is_said() -> None:
+    with pytest.warns(UserWarning, match="goal_horizon 50 leaves 33 of 180 steps"):
+        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), goal_horizon=50)
 
 
 def test_what_is_told_of_other_sizes_is_refused() -> None:
     for s, way in (((7,), (2,)), ((7,), (1,)), ((6,), (3,)), ((2, 7), (3,))):
         with pytest.raises(BadInput, match=r"s \[..., 7\] and a way \[..., 3\]"):
-            Mine().heard(np.zeros(s), np.zeros(way))
+            Mine().check_inputs(np.zeros(s), np.zeros(way))
 
 
-def test_a_look_ahead_longer_than_all_episodes_is_said() -> None:
-    with pytest.raises(BadInput, match="no episode lasts look_ahead = 61 steps"):
-        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), look_ahead=61)
+def test_a_goal_horizon_longer_than_all_episodes_is_said() -> None:
+    with pytest.raises(BadInput, match="no episode lasts goal_horizon = 61 steps"):
+        generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), goal_horizon=61)
 
 
 def test_nothing_can_be_stepped() -> None:
     robot = Mine()
-    for call in (robot.reset, robot.step, robot.place, robot.cost):
+    for call in (robot.reset, robot.step, robot.set_state, robot.cost):
         with pytest.raises(BadInput, match="known by its logs alone"):
             call(None, None)
 
@@ -105,17 +105,17 @@ def test_logs_that_are_none_are_refused(changes: dict, why: str) -> None:
     with pytest.raises(BadInput, match=why):
         generalize(
             Mine(), dataclasses.replace(log(), **changes), jax.random.key(0),
-            Generalize(mode="rotate"), look_ahead=20,
+            Generalize(mode="rotate"), goal_horizon=20,
         )  # fmt: skip
 
 
 # ── what logs are like (each was seen on somebody's) ────────────────────────────────────
 
 
-def ways(experience: Experience, look_ahead: int = 20) -> np.ndarray:
+def ways(experience: Experience, goal_horizon: int = 20) -> np.ndarray:
     """d of the record and of its turned copy, `[2, N, 3]`."""
     rotate = Generalize(mode="rotate")
-    pairs, _ = generalize(Mine(), experience, jax.random.key(0), rotate, look_ahead=look_ahead)
+    pairs, _ = generalize(Mine(), experience, jax.random.key(0), rotate, goal_horizon=goal_horizon)
     return np.asarray(pairs.d)
 
 
@@ -177,7 +177,7 @@ def test_positions_of_utm_size_are_turned_as_well_as_small_ones() -> None:
     far = dataclasses.replace(near, o=near.o + north, o_next=near.o_next + north)
     np.testing.assert_allclose(ways(far), ways(near), atol=1e-5)
     rotate = Generalize(mode="rotate")
-    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, look_ahead=20)
+    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, goal_horizon=20)
     assert residual["median"].max() < 1e-6
 
 
@@ -202,7 +202,7 @@ def angles(scale: float = 1.0, turns: float = 0.0) -> Experience:
 
 def samples(robot: Logged, experience: Experience) -> Pairs:
     rotate = Generalize(mode="rotate")
-    return generalize(robot, experience, jax.random.key(0), rotate, look_ahead=20)[0]
+    return generalize(robot, experience, jax.random.key(0), rotate, goal_horizon=20)[0]
 
 
 def test_an_angle_and_the_same_a_turn_on_are_one_state() -> None:
@@ -291,8 +291,8 @@ def foreign(directory: Path, **changes: Any) -> None:
         (dict(latent_size=10**18), "latent_size must be at most"),
         (dict(latent_size=-1), "latent_size must be at least"),
         (dict(latent_size=3), "where its architecture has"),
-        (dict(action_size=3), "action_size must be"), (dict(frame="body"), "frame must be"),
-        (dict(frame=None), "frame must be"), (dict(robot=None), "a controller for None"),
+        (dict(action_size=3), "action_size must be"), (dict(input_frame="body"), "frame must be"),
+        (dict(input_frame=None), "frame must be"), (dict(robot=None), "a controller for None"),
         (dict(robot=["mine"]), "a controller for"),
         (dict(robot="a\x1b[2J\nb"), r"for 'a\\x1b\[2J\\n"),
         (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\) there"),
@@ -390,7 +390,7 @@ def test_positions_far_away_count_from_the_first_step_that_is_valid() -> None:
     near = dataclasses.replace(log(), valid=valid)
     np.testing.assert_allclose(ways(far), ways(near), atol=1e-5)
     rotate = Generalize(mode="rotate")
-    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, look_ahead=20)
+    _, residual = generalize(Mine(), far, jax.random.key(0), rotate, goal_horizon=20)
     assert residual["p90"].max() < 1e-5
 
 
@@ -436,15 +436,15 @@ def test_an_empty_record_is_said_to_be_empty() -> None:
 def test_a_record_of_one_step_is_learned_from() -> None:
     one = jax.tree.map(lambda x: x[:1], log())
     one = dataclasses.replace(one, last=~one.valid | True)
-    assert ways(one, look_ahead=1).shape == (2, 3, 3)
-    with pytest.raises(BadInput, match="no episode lasts look_ahead = 2 steps"):
-        ways(one, look_ahead=2)
+    assert ways(one, goal_horizon=1).shape == (2, 3, 3)
+    with pytest.raises(BadInput, match="no episode lasts goal_horizon = 2 steps"):
+        ways(one, goal_horizon=2)
 
 
 @pytest.mark.parametrize("wrong", [1.5, 0, -1, True, "20", np.nan, 10**30, None])
-def test_a_look_ahead_that_is_no_number_of_steps_is_refused(wrong: Any) -> None:
-    with pytest.raises(BadInput, match="look_ahead must be"):
-        ways(log(), look_ahead=wrong)
+def test_a_goal_horizon_that_is_no_number_of_steps_is_refused(wrong: Any) -> None:
+    with pytest.raises(BadInput, match="goal_horizon must be"):
+        ways(log(), goal_horizon=wrong)
 
 
 def walking(yaw: np.ndarray, aside: float = 0.0) -> tuple[Experience, np.ndarray]:

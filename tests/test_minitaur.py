@@ -22,7 +22,7 @@ from original_minitaur import AFTER, RECORD, actions, original
 
 from genidm import devices, symmetry
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test, flatten
+from genidm.evaluation.evaluate import EvaluationSettings, flatten
 from genidm.evaluation.evaluator import Evaluator
 from genidm.evaluation.scenarios import scenarios
 from genidm.robots import Minitaur, State, by_name
@@ -118,7 +118,7 @@ def test_a_motor_that_is_hot_for_a_second_is_off_for_good(simulation: Simulation
     row = simulation.read()
     heat = slice(WIDTH - 16, WIDTH - 8)
     row[heat] = [PATIENT - 1, 0, 0, 0, 0, 0, 0, PATIENT + 1]
-    simulation.place(row)
+    simulation.set_state(row)
     strong = np.array([0, 0, 0, 0, -1, -1, -1, -1.0])
     given = []
     push = simulation._push
@@ -154,7 +154,7 @@ def test_a_step_is_one_of_a_live_simulation(simulation: Simulation) -> None:
         live = simulation.read()
         again = stepped(simulation, np.concatenate([before, action]))
         apart.append(np.abs(again - live)[:23].max())  # m, rad
-        simulation.place(live)
+        simulation.set_state(live)
     assert np.median(apart) < 1e-3 and max(apart) < 0.05
 
 
@@ -210,13 +210,13 @@ def test_yaw_commutes_with_physics_in_the_air(minitaur: Minitaur, starts: State)
     yaw, still = jnp.linspace(-3, 3, LANES), jnp.zeros(LANES)
     given = [chosen(i) for i in range(5)]
     physics = thrown(starts)
-    straight = followed(minitaur, minitaur.place(physics, still), given)
-    turned = followed(minitaur, minitaur.place(physics, yaw), given)
-    exact = minitaur.turn_physics(straight.physics, yaw)
+    straight = followed(minitaur, minitaur.set_state(physics, still), given)
+    turned = followed(minitaur, minitaur.set_state(physics, yaw), given)
+    exact = minitaur.rotate_physics(straight.physics, yaw)
     assert_near(turned.physics.pose, exact.pose, 3e-3)
     assert_near(turned.physics.motion, exact.motion, 0.1)
     assert_near(turned.physics.motors, exact.motors, 0.02)
-    s = minitaur.observation.turn(straight.observation, yaw)
+    s = minitaur.observation.rotate(straight.observation, yaw)
     s, got = s.at[:, 16].set(0), turned.observation.at[:, 16].set(0)  # headings wrap
     assert_near(got, s, 0.03)
     assert_near(jnp.cos(turned.heading - straight.heading - yaw), 1.0, 1e-4)
@@ -226,9 +226,9 @@ def test_yaw_commutes_with_physics_in_the_air(minitaur: Minitaur, starts: State)
 
 def test_yaw_commutes_with_physics_on_the_floor(minitaur: Minitaur, starts: State) -> None:
     yaw, given = jnp.linspace(-3, 3, LANES), [chosen(i) for i in range(10)]
-    straight = followed(minitaur, minitaur.place(starts.physics, jnp.zeros(LANES)), given)
-    turned = followed(minitaur, minitaur.place(starts.physics, yaw), given)
-    apart = symmetry.turn_vector(straight.position, yaw) - turned.position
+    straight = followed(minitaur, minitaur.set_state(starts.physics, jnp.zeros(LANES)), given)
+    turned = followed(minitaur, minitaur.set_state(starts.physics, yaw), given)
+    apart = symmetry.rotate_vector(straight.position, yaw) - turned.position
     assert np.median(np.linalg.norm(apart, axis=-1)) < 2e-3
 
 
@@ -236,9 +236,9 @@ def test_mirror_nearly_commutes_with_physics(minitaur: Minitaur, starts: State) 
     """The model is its own mirror image but for 5 mm at the knees and one motor's inertia."""
     given, still = [chosen(i) for i in range(5)], jnp.zeros(LANES)
     physics = thrown(starts)
-    there = followed(minitaur, minitaur.place(physics, still), given)
+    there = followed(minitaur, minitaur.set_state(physics, still), given)
     across = followed(
-        minitaur, minitaur.place(minitaur.mirror_physics(physics), still),
+        minitaur, minitaur.set_state(minitaur.mirror_physics(physics), still),
         [minitaur.action.mirror(a) for a in given],
     )  # fmt: skip
     exact = minitaur.mirror_physics(there.physics)
@@ -286,7 +286,7 @@ def test_falls(minitaur: Minitaur, starts: State, lowered: float, tilt: float, f
     )
     rest[:, 2] += 1 - lowered if tilt else -lowered
     rest[:, 3:7] = [math.cos(tilt / 2), math.sin(tilt / 2), 0, 0]
-    state = minitaur.place(from_rows(jnp.asarray(rest)), jnp.zeros(LANES))
+    state = minitaur.set_state(from_rows(jnp.asarray(rest)), jnp.zeros(LANES))
     assert not state.fallen.any()  # a start is not judged
     state = minitaur.step(state, jnp.zeros((LANES, 8)))
     assert (np.asarray(state.fallen) == falls).all()
@@ -301,16 +301,18 @@ def test_reward_is_that_of_pybullet_envs_a_second(minitaur: Minitaur) -> None:
     energy = np.abs((x["torque"] * x["rates"][:8]).sum(0)) * 0.002
     forward = np.asarray(step.after.position - step.before.position)[:, 0]
     assert not step.terminal.any() and energy.max() > 1e-3
-    expected = (forward - 0.005 * energy) / 0.01 + minitaur.alive_bonus
+    expected = (forward - 0.005 * energy) / 0.01 + minitaur.healthy_reward
     assert_near(step.reward, expected, 1e-4)
 
 
 def test_processes_are_kept_busy_and_no_more(minitaur: Minitaur) -> None:
     """A robot whose episode is over costs a step, too: who asks for 512 gets 32 a process."""
-    bank = flatten(scenarios(minitaur, seeds=1, episodes=600))
-    queue = Evaluator(minitaur, bank, Test(), devices.mesh(jax.devices()[:1])).start()
+    tested_scenarios = flatten(scenarios(minitaur, seeds=1, episodes=600))
+    queue = Evaluator(
+        minitaur, tested_scenarios, EvaluationSettings(), devices.mesh(jax.devices()[:1])
+    ).start()
     assert queue.running.episode.shape == (64,)
-    assert minitaur.at_once(10) == 10
+    assert minitaur.max_parallel_envs(10) == 10
 
 
 def test_physics_that_is_not_finite_ends_the_lane(minitaur: Minitaur, starts: State) -> None:
@@ -337,7 +339,7 @@ def test_the_env_sees_what_the_robot_sees(starts: State, observed: Any) -> None:
     robot, env = Minitaur(observed=observed), MinitaurEnv(observed=observed)
     check_env(env, skip_render_check=True)
     s, _ = env.reset(options={"row": rows(starts.physics)[3]})
-    state = robot.place(starts.physics, jnp.zeros(LANES))
+    state = robot.set_state(starts.physics, jnp.zeros(LANES))
     assert_near(s, state.observation[3], 1e-5)
     s, reward, fallen, _, _ = env.step(np.asarray(chosen()[3]))
     after = robot.step(state, chosen())
@@ -406,11 +408,11 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 
 def test_the_drawing_lies_as_pybullet_has_it(minitaur: Minitaur, starts: State) -> None:
-    model = minitaur.drawing().compile()
+    model = minitaur.visual_model().compile()
     data, live = mujoco.MjData(model), Simulation()
     bullet, body = live.bullet, live.body
-    for row, qpos in zip(rows(starts.physics), minitaur.posture(starts.physics), strict=True):
-        live.place(row)
+    for row, qpos in zip(rows(starts.physics), minitaur.visual_qpos(starts.physics), strict=True):
+        live.set_state(row)
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         for link in live.motors + live.knees:

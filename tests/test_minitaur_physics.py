@@ -76,5 +76,5 @@ def test_speed_is_told_beside_one_process_of_the_same_kind() -> None:
 
 
 def test_options_that_measure_nothing_are_refused() -> None:
-    with pytest.raises(minitaur_physics.BadInput, match="lanes"):
-        dataclasses.replace(minitaur_physics.Options(), lanes=0).check()
+    with pytest.raises(minitaur_physics.BadInput, match="num-envs"):
+        dataclasses.replace(minitaur_physics.Options(), num_envs=0).check()

@@ -33,7 +33,7 @@ pytest.importorskip("pybullet", reason="PyBullet is not installed: there is no w
 
 TASK = WalkForward(episode_steps=30)
 STEPS = 5 * 16 * 8
-STANDING = jax.tree_util.Partial(lambda s, displacement: 0 * s[:, :8])
+STANDING = jax.tree_util.Partial(lambda s, relative_goal: 0 * s[:, :8])
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +102,8 @@ def test_segments_stay_near_the_record(
 
 
 def test_it_is_tested(robot: Minitaur, undisturbed: tuple[Experience, Any]) -> None:
-    bank = scenarios(robot, seeds=2, episodes=4)
-    out = evaluate(robot, STANDING, bank, dataclasses.replace(TEST, max_steps=20))
+    tested_scenarios = scenarios(robot, seeds=2, episodes=4)
+    out = evaluate(robot, STANDING, tested_scenarios, dataclasses.replace(TEST, max_steps=20))
     assert (out.steps == 20).all() and not out.fell.any()
     assert ((out.start >= 1.4) & (out.start <= 2.6)).all()
 
@@ -111,6 +111,6 @@ def test_it_is_tested(robot: Minitaur, undisturbed: tuple[Experience, Any]) -> N
 def test_a_baseline_learns_on_it(robot: Minitaur) -> None:
     _, learner = collect(robot, AGENTS[SAC], 256, task=GoToGoal(), keep=False, quiet=True)
     numbers = [
-        x for x in jax.tree.leaves(learner.training) if jnp.issubdtype(x.dtype, jnp.floating)
+        x for x in jax.tree.leaves(learner.training_state) if jnp.issubdtype(x.dtype, jnp.floating)
     ]
     assert all(jnp.isfinite(x).all() for x in numbers)

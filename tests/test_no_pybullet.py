@@ -23,7 +23,7 @@ def test_asking_for_the_minitaur_says_what_to_install(absent: None) -> None:
 
 
 def test_its_command_ends_in_one_sentence(absent: None, tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["minitaur_rs", "--out", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["minitaur_rs", "--run-dir", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
         command.main(Minitaur, by_name("RS", "minitaur"))
     said = capsys.readouterr().err.splitlines()

@@ -18,14 +18,14 @@ from bits import close, flip, leaves, same, truncate
 from brax.training.acme import running_statistics
 from brax.training.agents.sac.losses import make_losses
 from brax.training.agents.sac.networks import make_sac_networks
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 from killing import Killed, dies_at
 from point import Point
 from prepared import Prepared
 
 from genidm import devices, tasks
 from genidm.agents import collect as collecting
-from genidm.agents import walking
+from genidm.agents import unroll
 from genidm.agents.collect import collect
 from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER
@@ -34,21 +34,27 @@ from genidm.agents.policy import no_statistics, normalize
 from genidm.agents.remembering import Remembering
 from genidm.agents.sac import SAC
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.experience import load_chunks
 from genidm.files import load_json
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.robots import Robot, State
 from genidm.store import Stage
-from genidm.tasks import GoToGoal, Lanes, Sparse, Step, Task, Verdict, WalkForward, inputs
+from genidm.tasks import EnvState, GoToGoal, Outcome, Sparse, Task, Transition, WalkForward, inputs
 
 # It falls, it diverges, and it runs into the time limit; the ring is full after 3 iterations.
 ROBOT = Point(speed=2.0, falls_at=0.25, diverges_at=0.3)
 SMALL: dict[str, Any] = dict(
-    lanes=16, unroll=8, updates=4, batch=32, capacity=400, warmup=200, hidden=(16,),
-    critic_hidden=(16,),
-)  # fmt: skip
+    num_envs=16,
+    unroll_length=8,
+    grad_updates_per_step=4,
+    batch_size=32,
+    max_replay_size=400,
+    min_replay_size=200,
+    policy_hidden_layer_sizes=(16,),
+    critic_hidden_layer_sizes=(16,),
+)
 SIZE = 16 * 8
 ITERATIONS = 5
 
@@ -75,16 +81,20 @@ def undisturbed(name: str) -> tuple[Any, Any]:
 
 INPUTS, ACTIONS, BATCH = 13, 3, 64
 SETTINGS: dict[str, Any] = dict(
-    hidden=(16, 12), critic_hidden=(16, 12), discount=0.9, reward_scale=0.3, tau=0.2
+    policy_hidden_layer_sizes=(16, 12),
+    critic_hidden_layer_sizes=(16, 12),
+    discounting=0.9,
+    reward_scaling=0.3,
+    tau=0.2,
 )
 
 
-def minibatch(seed: int = 0) -> Transition:
+def minibatch(seed: int = 0) -> BraxTransition:
     """Some steps are ends, some are cut off, and some inputs are far out."""
     rng = np.random.default_rng(seed)
     x, x_next = rng.normal(size=(2, BATCH, INPUTS)) * np.where(rng.random(INPUTS) < 0.2, 50, 1)
     terminal, cut = np.arange(BATCH) % 5 == 0, np.arange(BATCH) % 7 == 1
-    return Transition(
+    return BraxTransition(
         observation=jnp.float32(x),
         action=jnp.float32(rng.uniform(-1, 1, size=(BATCH, ACTIONS))),
         reward=jnp.float32(3 * rng.normal(size=BATCH)),
@@ -124,7 +134,7 @@ def descent(loss: Callable) -> Callable:
 def test_sacs_update_is_made_of_braxs_losses() -> None:
     """In Brax's order, but that the policy climbs the critic as it has just become."""
     agent = SAC(**SETTINGS)
-    networks = make_sac_networks(INPUTS, ACTIONS, normalize, agent.hidden)
+    networks = make_sac_networks(INPUTS, ACTIONS, normalize, agent.policy_hidden_layer_sizes)
     alpha_step, critic_step, policy_step = map(descent, make_losses(networks, 0.3, 0.9, ACTIONS))
     ours = algorithm(agent).start(jax.random.key(0))
     same(ours.critic, ours.target)
@@ -172,7 +182,9 @@ def q(critic: Any, x: np.ndarray, a: np.ndarray) -> float:
     return forward(critic["params"]["MLP_0"], np.concatenate([normal(x), np.float64(a)]))[0]
 
 
-def critic_oracle(critic: Any, policy_target: Any, critic_target: Any, batch: Transition) -> float:
+def critic_oracle(
+    critic: Any, policy_target: Any, critic_target: Any, batch: BraxTransition
+) -> float:
     total = 0.0
     for i in range(BATCH):
         if batch.extras["state_extras"]["truncation"][i]:
@@ -186,7 +198,7 @@ def critic_oracle(critic: Any, policy_target: Any, critic_target: Any, batch: Tr
     return total / BATCH
 
 
-def policy_oracle(policy: Any, critic: Any, batch: Transition) -> float:
+def policy_oracle(policy: Any, critic: Any, batch: BraxTransition) -> float:
     total = 0.0
     for x in np.asarray(batch.observation):
         raw = mu(policy, x)
@@ -329,16 +341,18 @@ class Pointing(GoToGoal):
     episode_steps: int = 4
     bearing: float = math.pi
 
-    def judge(self, robot: Robot, lanes: Lanes, action: jax.Array, after: State) -> Step:
-        reward = BONUS - jnp.sum((action - wanted(lanes.displacement)) ** 2, axis=-1)
-        verdict = Verdict(reward, lanes.displacement[:, 0] > 0, jnp.full_like(reward, REST))
-        return tasks.to_step(lanes, action, after, verdict, self.episode_steps)
+    def transition(
+        self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
+    ) -> Transition:
+        reward = BONUS - jnp.sum((action - wanted(lanes.relative_goal)) ** 2, axis=-1)
+        outcome = Outcome(reward, lanes.relative_goal[:, 0] > 0, jnp.full_like(reward, REST))
+        return tasks.to_transition(lanes, action, after, outcome, self.episode_steps)
 
 
 def critics(agent: Any, learner: Any, x: jax.Array, a: jax.Array) -> np.ndarray:
     networks = agent.networks(ROBOT, x.shape[-1])
     network = networks.q_network if isinstance(agent, SAC) else networks[1]
-    training = learner.training
+    training = learner.training_state
     return np.asarray(network.apply(training.statistics, training.networks.critic, x, a)).min(-1)
 
 
@@ -346,7 +360,7 @@ def entropy_bonus(agent: Any, learner: Any, x: jax.Array, best: jax.Array) -> np
     """What SAC's own noise costs a step, and its entropy is worth; DDPG has none."""
     if not isinstance(agent, SAC):
         return np.zeros(len(x))
-    networks, training = agent.networks(ROBOT, x.shape[-1]), learner.training
+    networks, training = agent.networks(ROBOT, x.shape[-1]), learner.training_state
     distribution = networks.parametric_action_distribution
     logits = networks.policy_network.apply(training.statistics, training.networks.policy, x)
     raw = distribution.sample_no_postprocessing(logits, jax.random.key(5))
@@ -358,16 +372,24 @@ def entropy_bonus(agent: Any, learner: Any, x: jax.Array, best: jax.Array) -> np
 @pytest.mark.parametrize("learner", [SAC, DDPG])
 def test_values_and_actions_are_the_known_ones(learner: type) -> None:
     agent = learner(
-        lanes=16, unroll=8, updates=16, batch=64, warmup=500, hidden=(32,),
-        critic_hidden=(32, 32), discount=DISCOUNT, learning_rate=3e-3, tau=0.02,
-    )  # fmt: skip
+        num_envs=16,
+        unroll_length=8,
+        grad_updates_per_step=16,
+        batch_size=64,
+        min_replay_size=500,
+        policy_hidden_layer_sizes=(32,),
+        critic_hidden_layer_sizes=(32, 32),
+        discounting=DISCOUNT,
+        learning_rate=3e-3,
+        tau=0.02,
+    )
     robot, task = Point(speed=0.0), Pointing()
     _, learned = collect(robot, agent, 30_000, task=task, keep=False, quiet=True)
     lanes = jax.jit(functools.partial(task.start, robot))(jax.random.split(jax.random.key(9), 600))
-    s, way = lanes.robots.observation, lanes.displacement
+    s, way = lanes.robots.observation, lanes.relative_goal
     best = wanted(way)
-    chosen = jax.jit(agent.policy(robot, task, learned).__call__)(s, way)
-    missed = np.sqrt(np.sum((chosen - best) ** 2, axis=-1))
+    actor_params = jax.jit(agent.policy(robot, task, learned).__call__)(s, way)
+    missed = np.sqrt(np.sum((actor_params - best) ** 2, axis=-1))
     assert missed.mean() < 0.25  # of 0.5 that standing still would miss
     x = inputs(s, way)
     noise = entropy_bonus(agent, learned, x, best)
@@ -384,15 +406,21 @@ def test_values_and_actions_are_the_known_ones(learner: type) -> None:
 def share_reached(agent: OffPolicy) -> float:
     """Of 300 goals in all directions, after 60 000 interactions."""
     robot = Point(speed=4.0)
-    task = GoToGoal(reward=Sparse(), episode_steps=60, reach=0.2, bearing=math.pi)
+    task = GoToGoal(reward=Sparse(), episode_steps=60, goal_radius=0.2, bearing=math.pi)
     _, learner = collect(robot, agent, 60_000, task=task, keep=False, quiet=True)
-    settings = Test(max_steps=60, reach=0.2, lanes=300, chunk=60)
+    settings = EvaluationSettings(max_steps=60, goal_radius=0.2, num_envs=300, chunk=60)
     policy = agent.policy(robot, task, learner)
     return evaluate(robot, policy, scenarios(robot, 1, 300), settings, quiet=True).reached.mean()
 
 
 GOALS: dict[str, Any] = dict(
-    lanes=16, unroll=8, updates=16, batch=128, warmup=1000, critic_hidden=(64, 64), discount=0.95
+    num_envs=16,
+    unroll_length=8,
+    grad_updates_per_step=16,
+    batch_size=128,
+    min_replay_size=1000,
+    critic_hidden_layer_sizes=(64, 64),
+    discounting=0.95,
 )
 
 
@@ -412,7 +440,7 @@ def test_with_hindsight_ddpg_goes_there_too() -> None:
 def test_recording_changes_no_parameter_by_a_bit(name: str, monkeypatch) -> None:
     agent, task = LEARNERS[name]
     recording = undisturbed(name)[1]
-    monkeypatch.setattr(walking, "record", lambda step: None)
+    monkeypatch.setattr(unroll, "record", lambda step: None)
     blind = agent.learning(ROBOT, task, devices.mesh())
     learner = blind.place(jax.jit(blind.start)(jax.random.key(0)))
     iterate = blind.prepare(learner)
@@ -442,25 +470,29 @@ def test_learning_waits_until_it_is_warm_and_then_moves_everything(name: str) ->
     task = LEARNERS[name][1]
     learning = PREPARED[name].learning(ROBOT, task, devices.mesh())
     learner = learning.place(jax.jit(learning.start)(jax.random.key(0)))
-    begun = jax.tree.map(jnp.copy, learner.training.networks)
+    begun = jax.tree.map(jnp.copy, learner.training_state.networks)
     iterate = learning.prepare(learner)
     learner, _, info = iterate(learner)
-    same(learner.training.networks, begun)
+    same(learner.training_state.networks, begun)
     assert info["critic_loss"] == info["policy_loss"] == 0
     learner, _, info = iterate(learner)
     moved = [
         abs(x - y).max()
-        for x, y in zip(*map(leaves, (learner.training.networks, begun)), strict=True)
+        for x, y in zip(*map(leaves, (learner.training_state.networks, begun)), strict=True)
     ]
     assert min(moved) > 0 and info["critic_loss"] > 0
-    assert learner.training.statistics.count.lo == learner.training.buffer.written * 16 == 2 * SIZE
+    assert (
+        learner.training_state.statistics.count.lo
+        == learner.training_state.buffer.written * 16
+        == 2 * SIZE
+    )
 
 
 @each
 def test_the_buffer_holds_what_was_recorded_and_nothing_that_diverged(name: str) -> None:
     record, learner = undisturbed(name)
-    rows, newest = learner.training.buffer.rows, 3 * 8
-    assert learner.training.buffer.written == 5 * 8 and rows.last.shape == (newest, 16)
+    rows, newest = learner.training_state.buffer.rows, 3 * 8
+    assert learner.training_state.buffer.written == 5 * 8 and rows.last.shape == (newest, 16)
     row = np.arange(5 * 8 - newest, 5 * 8) % newest
     for ours, theirs in ((rows.s, record.s), (rows.a, record.a), (rows.o_next, record.o_next)):
         np.testing.assert_array_equal(np.asarray(ours)[row], theirs[-newest:])
@@ -475,7 +507,7 @@ def test_the_statistics_are_those_of_the_inputs(name: str) -> None:
     record, learner = undisturbed(name)
     size = record.s.shape[-1]
     seen = np.float64(record.s).reshape(-1, size)
-    found = learner.training.statistics
+    found = learner.training_state.statistics
     np.testing.assert_allclose(found.mean[:size], seen.mean(0), rtol=0, atol=1e-4)
     np.testing.assert_allclose(found.std[:size], np.maximum(seen.std(0), 1e-6), rtol=0, atol=1e-3)
 
@@ -526,7 +558,9 @@ def test_a_collection_that_is_done_is_not_made_again(killed, monkeypatch) -> Non
 
 @each
 @pytest.mark.parametrize("harm", [flip, truncate, Path.unlink])
-def test_with_a_torn_part_of_the_buffer_it_ends_in_the_same_bits(killed, name: str, harm) -> None:
+def test_with_a_corrupt_part_of_the_buffer_it_ends_in_the_same_bits(
+    killed, name: str, harm
+) -> None:
     """The newest part: the checkpoint before is gone on from. The oldest: all is done anew."""
     for which, goes_on_from in ((-1, 2), (0, None)):
         stage = killed(5, name, keep=True)
@@ -546,7 +580,9 @@ def test_a_checkpoint_writes_the_new_rows_alone(killed, name: str) -> None:
     directory = stage.path("checkpoints")
     spans = sorted(part.name.split("_")[1:] for part in directory.glob("part_*"))
     assert [(int(first), int(end)) for first, end in spans] == [(0, 16), (16, 32)]
-    rows = sum(x.nbytes for x in jax.tree.leaves(undisturbed(name)[1].training.buffer.rows)) / 24
+    rows = (
+        sum(x.nbytes for x in jax.tree.leaves(undisturbed(name)[1].training_state.buffer.rows)) / 24
+    )
     for part in directory.glob("part_*"):
         size = sum(np.load(file).nbytes for file in part.glob("*.npy"))
         assert size == 16 * rows
@@ -568,7 +604,7 @@ def test_what_has_learned_nan_is_not_done(tmp_path: Path, name: str) -> None:
     with pytest.raises(
         BadInput, match=r"training/networks/\S+ holds NaN or infinity after 640 int"
     ):
-        stage.once(work)
+        stage.run_once(work)
     assert not stage.done and not stage.checkpoints().steps()
 
 
@@ -579,8 +615,11 @@ def test_what_has_learned_nan_is_not_done(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
-        *(({name: 0}, "at least 1") for name in ("lanes", "unroll", "updates", "batch")),
-        *(({"discount": x}, "discount") for x in (0.0, 1.0, -1.0)),
+        *(
+            ({name: 0}, "at least 1")
+            for name in ("num_envs", "unroll_length", "grad_updates_per_step", "batch_size")
+        ),
+        *(({"discounting": x}, "discounting") for x in (0.0, 1.0, -1.0)),
     ],
 )
 def test_settings_that_cannot_be_are_refused(learner: type, wrong: dict, why: str) -> None:
@@ -589,9 +628,9 @@ def test_settings_that_cannot_be_are_refused(learner: type, wrong: dict, why: st
 
 
 def test_a_buffer_that_is_too_small_is_refused() -> None:
-    with pytest.raises(BadInput, match="never holds the 200 of the warmup"):
-        SAC(**SMALL | {"capacity": 2 * SIZE - 1})
-    agent = SAC(**SMALL | {"capacity": 2 * SIZE - 1, "warmup": 0})
+    with pytest.raises(BadInput, match="never holds the 200 of min_replay_size"):
+        SAC(**SMALL | {"max_replay_size": 2 * SIZE - 1})
+    agent = SAC(**SMALL | {"max_replay_size": 2 * SIZE - 1, "min_replay_size": 0})
     learning = agent.learning(ROBOT, WalkForward(), devices.mesh())
     with pytest.raises(BadInput, match="holds no two iterations"):
         jax.eval_shape(learning.start, jax.random.key(0))

@@ -26,16 +26,16 @@ from genidm.agents.sac import SAC
 from genidm.controller import Controller
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import walking_speed
-from genidm.files import Torn
+from genidm.files import Corrupt
 from genidm.paper.idm import Architecture
 from genidm.tasks import GoToGoal, Task, WalkForward, inputs
 
 ROBOT = Point()
 S, A = ROBOT.observation.size, ROBOT.action.size
-SMALL: dict[str, Any] = dict(lanes=2, unroll=2, hidden=(7, 6))
-OFF: dict[str, Any] = dict(capacity=100, warmup=0, critic_hidden=(5,))
+SMALL: dict[str, Any] = dict(num_envs=2, unroll_length=2, policy_hidden_layer_sizes=(7, 6))
+OFF: dict[str, Any] = dict(max_replay_size=100, min_replay_size=0, critic_hidden_layer_sizes=(5,))
 AGENTS = {
-    "PPO": PPO(minibatches=2, **SMALL),
+    "PPO": PPO(num_minibatches=2, **SMALL),
     "SAC": SAC(**SMALL, **OFF),
     "DDPG": DDPG(**SMALL, **OFF),
 }
@@ -51,11 +51,11 @@ def learner(name: str, task: Task) -> Any:
     learning = AGENTS[name].learning(ROBOT, task, devices.mesh(jax.devices()[:1]))
     begun = jax.jit(learning.start)(jax.random.key(0))
     rng = np.random.default_rng(1)
-    size = S + 3 * task.directed
+    size = S + 3 * task.goal_conditioned
     seen = jnp.float32(rng.normal(size=(50, size)) * 10.0 ** rng.uniform(-2, 1, size) + 0.3)
-    statistics = running_statistics.update(begun.training.statistics, seen)
-    training = begun.training.replace(statistics=statistics)
-    return begun.replace(training=jax.tree.map(moved, training))
+    statistics = running_statistics.update(begun.training_state.statistics, seen)
+    training = begun.training_state.replace(statistics=statistics)
+    return begun.replace(training_state=jax.tree.map(moved, training))
 
 
 def moved(x: jax.Array) -> jax.Array:
@@ -79,7 +79,7 @@ ask = jax.jit(Policy.__call__)
 
 def braxs(name: str, task: Task, x: jax.Array) -> jax.Array:
     """Brax's own deterministic inference; DDPG, which Brax lacks, is tanh of its network."""
-    agent, training, size = AGENTS[name], learner(name, task).training, x.shape[-1]
+    agent, training, size = AGENTS[name], learner(name, task).training_state, x.shape[-1]
     if name == "DDPG":
         return jnp.tanh(
             agent.networks(ROBOT, size)[0].apply(training.statistics, training.networks.policy, x)
@@ -100,7 +100,7 @@ def test_it_answers_as_braxs_inference_does(name: str, task: Task) -> None:
     answer = ask(policy(name, task), s, way)
     assert answer.shape == (4, 5, A) and abs(answer).max() <= 1 and answer.std() > 0.1
     s = ROBOT.observation.canonical(s)
-    expected = braxs(name, task, inputs(s, way if task.directed else None))
+    expected = braxs(name, task, inputs(s, way if task.goal_conditioned else None))
     np.testing.assert_allclose(answer, expected, rtol=0, atol=1e-6)
 
 
@@ -128,7 +128,7 @@ def test_each_kind_of_controller_is_read_as_what_it_is(tmp_path: Path) -> None:
     params = architecture.init(jax.random.key(0), S)
     Controller(
         params=params, mean=jnp.zeros(S), std=jnp.ones(S), architecture=architecture,
-        frame="world", robot=ROBOT,
+        input_frame="world", robot=ROBOT,
     ).save(tmp_path / "controller")  # fmt: skip
     policy("SAC", GoToGoal()).save(tmp_path / "policy")
     kinds = [type(controller.load(tmp_path / x, ROBOT)) for x in ("controller", "policy")]
@@ -140,7 +140,7 @@ def test_nothing_is_written_over_unasked(tmp_path: Path) -> None:
     with pytest.raises(BadInput):
         policy("SAC", GoToGoal()).save(tmp_path / "policy")
     policy("SAC", GoToGoal()).save(tmp_path / "policy", overwrite=True)
-    assert controller.load(tmp_path / "policy", ROBOT).directed
+    assert controller.load(tmp_path / "policy", ROBOT).goal_conditioned
 
 
 def test_the_policy_of_another_robot_is_refused(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_what_is_no_controller_is_refused(tmp_path: Path) -> None:
         controller.load(tmp_path / "policy", ROBOT)
     policy("PPO", GoToGoal()).save(tmp_path / "policy", overwrite=True)
     (tmp_path / "policy" / "mean.npy").unlink()
-    with pytest.raises(Torn, match=r"mean\.npy is missing"):
+    with pytest.raises(Corrupt, match=r"mean\.npy is missing"):
         controller.load(tmp_path / "policy", ROBOT)
 
 
@@ -174,7 +174,7 @@ class Ahead:
 
     pace: float
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         yaw = ROBOT.observation.yaw(s)
         way = jnp.stack([jnp.cos(yaw), -jnp.sin(yaw), jnp.zeros_like(yaw)], axis=-1)
         return self.pace * way

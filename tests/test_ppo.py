@@ -15,40 +15,47 @@ import pytest
 from bits import close, leaves
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.losses import compute_ppo_loss
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 from killing import Killed, dies_at
 from point import Point
 from prepared import Prepared
 
 from genidm import devices
 from genidm.agents import collect as collecting
-from genidm.agents import ppo, walking
+from genidm.agents import ppo, unroll
 from genidm.agents.collect import collect
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
-from genidm.agents.walking import walk
+from genidm.agents.unroll import generate_unroll
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.experience import Experience, load_chunks
-from genidm.files import Torn
+from genidm.files import Corrupt
 from genidm.progress import METRICS, Progress, read_metrics
 from genidm.store import Stage
-from genidm.tasks import GoToGoal, Step, WalkForward
+from genidm.tasks import GoToGoal, Transition, WalkForward
 
 # It falls, and it runs into the time limit, so that episodes end in both ways.
 ROBOT = Point(speed=2.0, falls_at=0.25)
 TASK = WalkForward(episode_steps=9)
-AGENT = PPO(lanes=16, unroll=8, epochs=2, minibatches=4, hidden=(16,), value_hidden=(16,))
+AGENT = PPO(
+    num_envs=16,
+    unroll_length=8,
+    num_updates_per_batch=2,
+    num_minibatches=4,
+    policy_hidden_layer_sizes=(16,),
+    value_hidden_layer_sizes=(16,),
+)
 NETWORKS = AGENT.networks(ROBOT, TASK)
-SIZE = AGENT.lanes * AGENT.unroll
+SIZE = AGENT.num_envs * AGENT.unroll_length
 ITERATIONS = 5
 PREPARED = Prepared(AGENT)
 
 
 def gather(agent=PREPARED, iterations: int = ITERATIONS, **options) -> tuple[Experience, Any]:
     options = dict(task=TASK, quiet=True) | options
-    size = agent.lanes * agent.unroll
+    size = agent.num_envs * agent.unroll_length
     return collect(options.pop("robot", ROBOT), agent, iterations * size, **options)
 
 
@@ -67,22 +74,34 @@ def same(a: Any, b: Any) -> bool:
 
 def test_ppo_learns_the_way_that_is_rewarded() -> None:
     """Forward is +x, and a point at full speed makes 1 m/s."""
-    passes = dict(epochs=7, minibatches=8, learning_rate=3e-3)
-    agent = PPO(lanes=64, unroll=16, hidden=(32,), value_hidden=(32,), **passes)
+    passes = dict(num_updates_per_batch=7, num_minibatches=8, learning_rate=3e-3)
+    agent = PPO(
+        num_envs=64,
+        unroll_length=16,
+        policy_hidden_layer_sizes=(32,),
+        value_hidden_layer_sizes=(32,),
+        **passes,
+    )
     record, _ = gather(agent, 30, robot=Point(), task=WalkForward(64))
-    speed = (record.o_next - record.o)[..., 0] / Point.control_step
+    speed = (record.o_next - record.o)[..., 0] / Point.dt
     assert speed[:16].mean() < 0.4 and 0.9 < speed[-80:].mean() <= speed.max() < 1.0001
 
 
 def test_ppo_learns_the_way_to_goals() -> None:
     agent = PPO(
-        lanes=64, unroll=16, epochs=7, minibatches=8, learning_rate=3e-3, discount=0.95,
-        hidden=(32,), value_hidden=(32,),
-    )  # fmt: skip
-    robot, task = Point(speed=4.0), GoToGoal(episode_steps=60, reach=0.2)
+        num_envs=64,
+        unroll_length=16,
+        num_updates_per_batch=7,
+        num_minibatches=8,
+        learning_rate=3e-3,
+        discounting=0.95,
+        policy_hidden_layer_sizes=(32,),
+        value_hidden_layer_sizes=(32,),
+    )
+    robot, task = Point(speed=4.0), GoToGoal(episode_steps=60, goal_radius=0.2)
     _, learner = gather(agent, 130, robot=robot, task=task, keep=False)
     test, policy = (
-        Test(max_steps=60, reach=0.2, lanes=300, chunk=60),
+        EvaluationSettings(max_steps=60, goal_radius=0.2, num_envs=300, chunk=60),
         agent.policy(robot, task, learner),
     )
     assert evaluate(robot, policy, scenarios(robot, 1, 300), test, quiet=True).reached.mean() > 0.9
@@ -90,12 +109,12 @@ def test_ppo_learns_the_way_to_goals() -> None:
 
 def test_recording_changes_no_parameter_by_a_bit(monkeypatch) -> None:
     recording = undisturbed()[1]
-    of_step = walking.record  # PPO learns from the states and actions of its own record
+    of_step = unroll.record  # PPO learns from the states and actions of its own record
 
-    def least(step: Step) -> Any:
+    def least(step: Transition) -> Any:
         return of_step(step).replace(o_next=None, first=None, last=None, valid=None, physics=None)
 
-    monkeypatch.setattr(walking, "record", least)
+    monkeypatch.setattr(unroll, "record", least)
     blind = AGENT.learning(ROBOT, TASK, devices.mesh())
     learner = blind.place(jax.jit(blind.start)(jax.random.key(0)))
     iterate = blind.prepare(learner)
@@ -118,8 +137,8 @@ def test_seeds_matter_and_nothing_else_does() -> None:
 
 def test_what_learns_is_moved_by_every_iteration() -> None:
     learning = PREPARED.learning(ROBOT, TASK, devices.mesh())
-    begun = jax.jit(learning.start)(jax.random.key(0)).training.params
-    ended = undisturbed()[1].training
+    begun = jax.jit(learning.start)(jax.random.key(0)).training_state.params
+    ended = undisturbed()[1].training_state
     moved = [np.abs(x - y).max() for x, y in zip(leaves(begun), leaves(ended.params), strict=True)]
     assert min(moved) > 1e-4 and ended.statistics.count.lo == ITERATIONS * SIZE
 
@@ -128,14 +147,16 @@ def test_what_learns_is_moved_by_every_iteration() -> None:
 
 
 @functools.cache
-def walked() -> tuple[Any, Transition, Step, Any]:
+def walked() -> tuple[Any, BraxTransition, Transition, Any]:
     """8 steps of 16 lanes: what PPO packs of them, and the steps themselves, one by one."""
     distribution = NETWORKS.parametric_action_distribution
     policy = jax.jit(NETWORKS.policy_network.init)(jax.random.key(0))
     statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
     task = WalkForward(episode_steps=5)
     lanes = jax.jit(functools.partial(task.start, ROBOT))(jax.random.split(jax.random.key(1), 16))
-    packed = functools.partial(ppo._walk, ROBOT, task, NETWORKS, AGENT.unroll, AGENT.discount)
+    packed = functools.partial(
+        ppo._rollout, ROBOT, task, NETWORKS, AGENT.unroll_length, AGENT.discounting
+    )
     _, _, batch, _ = jax.jit(packed)(statistics, policy, lanes)
 
     def draw(key: jax.Array) -> jax.Array:
@@ -148,13 +169,19 @@ def walked() -> tuple[Any, Transition, Step, Any]:
         return distribution.postprocess(raw), (logits, raw)
 
     whole = functools.partial(
-        walk, ROBOT, task, AGENT.unroll, draw, choose, lambda step, notes: (step, notes)
+        generate_unroll,
+        ROBOT,
+        task,
+        AGENT.unroll_length,
+        draw,
+        choose,
+        lambda step, notes: (step, notes),
     )
     steps, choices = jax.tree.map(np.asarray, jax.jit(whole)(lanes)[2])
     return policy, batch, steps, choices
 
 
-def loss_of(batch: Transition) -> tuple[Any, dict[str, Any]]:
+def loss_of(batch: BraxTransition) -> tuple[Any, dict[str, Any]]:
     """Brax's loss `[B, T, ...]` of a policy a little off the one that walked."""
     params = target_params()
     statistics = running_statistics.init_state(jnp.zeros(ROBOT.observation.size))
@@ -181,7 +208,7 @@ def test_our_transitions_give_the_loss_of_braxs_own_layout() -> None:
     log_prob = jax.jit(NETWORKS.parametric_action_distribution.log_prob)(logits, raw)
     policy_extras = {"log_prob": log_prob, "raw_action": raw, "distribution_params": logits}
     truncated = np.float32(steps.last & ~steps.terminal)
-    whole = Transition(
+    whole = BraxTransition(
         observation=steps.before.observation,
         action=steps.action,
         reward=steps.reward,
@@ -214,7 +241,7 @@ def test_truncation_and_termination_count_as_in_a_slow_gae() -> None:
     assert (np.abs(ratio - 1) > 0.05).any() and abs(clipped.mean()) > 1e-3
 
 
-def slow_gae(steps: Step, truncated, values, final) -> tuple[np.ndarray, np.ndarray]:
+def slow_gae(steps: Transition, truncated, values, final) -> tuple[np.ndarray, np.ndarray]:
     """λ-returns less values, and one-step advantages towards them, lane by lane.
 
     A fall ends the return. At the time limit nobody knows what would have come, so that
@@ -251,7 +278,7 @@ def new_log_prob(params: Any) -> np.ndarray:
 
 def test_the_record_is_continuous_but_for_fresh_starts() -> None:
     r, _ = undisturbed()
-    assert r.first.shape == (ITERATIONS * AGENT.unroll, AGENT.lanes)
+    assert r.first.shape == (ITERATIONS * AGENT.unroll_length, AGENT.num_envs)
     goes_on = ~r.last[:-1]
     np.testing.assert_array_equal(r.o_next[:-1][goes_on], r.o[1:][goes_on])
     np.testing.assert_array_equal(r.first[1:], r.last[:-1])
@@ -273,7 +300,7 @@ def test_episodes_end_by_a_fall_or_at_the_time_limit() -> None:
 def test_the_recorded_action_leads_from_the_recorded_physics_to_the_next() -> None:
     r, _ = undisturbed()
     flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), r)
-    placed = jax.jit(ROBOT.place)(flat.physics, jnp.zeros(r.interactions))
+    placed = jax.jit(ROBOT.set_state)(flat.physics, jnp.zeros(r.interactions))
     after = jax.jit(ROBOT.step)(placed, flat.a)
     np.testing.assert_allclose(after.position, flat.o_next, rtol=0, atol=1e-5)
     onward = np.flatnonzero(~r.last[:-1].ravel())
@@ -284,7 +311,7 @@ def test_the_recorded_action_leads_from_the_recorded_physics_to_the_next() -> No
 def test_diverged_physics_never_reaches_the_record(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "collect", {})
     robot = Point(speed=2.0, diverges_at=0.3)
-    r, learner = gather(RandomActions(lanes=16, unroll=8), robot=robot, stage=stage)
+    r, learner = gather(RandomActions(num_envs=16, unroll_length=8), robot=robot, stage=stage)
     assert all(np.isfinite(x).all() for x in leaves((r, learner)))
     assert (~r.valid).any() and r.last[~r.valid].all()
     counted = [line["diverged"] for line in read_metrics(stage.path(METRICS))]
@@ -292,10 +319,10 @@ def test_diverged_physics_never_reaches_the_record(tmp_path: Path) -> None:
 
 
 def test_random_actions_cover_what_there_is() -> None:
-    r, _ = gather(RandomActions(lanes=16, unroll=8))
+    r, _ = gather(RandomActions(num_envs=16, unroll_length=8))
     assert -1 <= r.a.min() < -0.99 and 0.99 < r.a.max() <= 1
     assert abs(r.a.mean()) < 0.05 and r.a.std() == pytest.approx(3**-0.5, abs=0.02)
-    other, _ = gather(RandomActions(lanes=16, unroll=8), seed=1)
+    other, _ = gather(RandomActions(num_envs=16, unroll_length=8), seed=1)
     both = np.concatenate([r.a, other.a]).reshape(-1, ROBOT.action.size)
     assert len(np.unique(both, axis=0)) == len(both)  # no action twice, nor with another seed
 
@@ -324,11 +351,13 @@ def tear(stage: Stage) -> None:
     (stage.path("checkpoints") / f"step_{newest:09d}" / "leaves.json").write_text("{")
 
 
-@pytest.mark.parametrize(("iteration", "torn"), [(1, False), (3, False), (5, True)])
-def test_a_killed_collection_goes_on_to_the_same_bits(killed, iteration: int, torn: bool) -> None:
+@pytest.mark.parametrize(("iteration", "corrupt"), [(1, False), (3, False), (5, True)])
+def test_a_killed_collection_goes_on_to_the_same_bits(
+    killed, iteration: int, corrupt: bool
+) -> None:
     stage = killed(iteration)
     assert stage.checkpoints().steps() == [s for s in (2, 4) if s < iteration]
-    if torn:
+    if corrupt:
         tear(stage)
     record, learner = gather(stage=stage)
     assert same((record, learner), undisturbed())
@@ -350,11 +379,11 @@ def test_a_collection_goes_on_with_another_number_of_devices(killed) -> None:
     close(learner, undisturbed()[1], atol=1e-3)
 
 
-def test_a_torn_record_is_not_gone_on_from(killed) -> None:
+def test_a_corrupt_record_is_not_gone_on_from(killed) -> None:
     stage = killed(3)
     file = stage.path("experience") / "chunk_00000" / "a.npy"
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(Torn, match="cut short"):
+    with pytest.raises(Corrupt, match="cut short"):
         gather(stage=stage)
 
 
@@ -371,7 +400,7 @@ def test_a_learner_of_nan_is_refused_and_nothing_is_marked_done(tmp_path: Path) 
 
     for _ in range(2):  # the same command again says the same
         with pytest.raises(BadInput, match=r"training/params/\S+ holds NaN or infinity after 384 "):
-            stage.once(work)
+            stage.run_once(work)
         assert not stage.done and not stage.checkpoints().steps()
         assert not stage.path("experience").exists()
     with pytest.raises(BadInput, match="smaller learning rate"):
@@ -382,7 +411,7 @@ class Breaking:
     """An agent that works as another does, and whose state breaks in its nth iteration."""
 
     def __init__(self, agent: Any, at: int, broken: Callable[[Any], Any]):
-        self.agent, self.lanes, self.unroll = agent, agent.lanes, agent.unroll
+        self.agent, self.num_envs, self.unroll_length = agent, agent.num_envs, agent.unroll_length
         self.at, self.broken = at, broken
 
     def learning(self, *args) -> Any:
@@ -401,9 +430,9 @@ class Breaking:
 
 
 def with_infinity(learner: Any) -> Any:
-    mean = learner.training.statistics.mean.at[2].set(jnp.inf)
-    statistics = learner.training.statistics.replace(mean=mean)
-    return learner.replace(training=learner.training.replace(statistics=statistics))
+    mean = learner.training_state.statistics.mean.at[2].set(jnp.inf)
+    statistics = learner.training_state.statistics.replace(mean=mean)
+    return learner.replace(training_state=learner.training_state.replace(statistics=statistics))
 
 
 def test_what_was_whole_before_is_kept_and_gone_on_from(tmp_path: Path, monkeypatch) -> None:
@@ -417,7 +446,7 @@ def test_what_was_whole_before_is_kept_and_gone_on_from(tmp_path: Path, monkeypa
 
 def test_interactions_are_counted_once_and_rounded_up(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "collect", {})
-    agent = RandomActions(lanes=16, unroll=8)
+    agent = RandomActions(num_envs=16, unroll_length=8)
     record, _ = collect(ROBOT, agent, 3 * SIZE + 1, task=TASK, stage=stage, quiet=True)
     assert record.interactions == record.s.shape[0] * record.s.shape[1] == 4 * SIZE
     assert read_metrics(stage.path(METRICS))[-1]["step"] == 4 * SIZE
@@ -427,7 +456,9 @@ def test_interactions_are_counted_once_and_rounded_up(tmp_path: Path) -> None:
 # ── bad input ───────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("agent", [PPO(lanes=9, minibatches=3, unroll=4), RandomActions(lanes=9)])
+@pytest.mark.parametrize(
+    "agent", [PPO(num_envs=9, num_minibatches=3, unroll_length=4), RandomActions(num_envs=9)]
+)
 def test_as_many_devices_share_the_lanes_as_can(agent) -> None:
     one = devices.mesh(jax.devices()[:1])
     assert same(collect(ROBOT, agent, 36)[0], collect(ROBOT, agent, 36, mesh=one)[0])
@@ -445,7 +476,10 @@ def test_no_interactions_are_refused() -> None:
         collect(ROBOT, AGENT, 0)
 
 
-@pytest.mark.parametrize("wrong", [{"lanes": 10, "minibatches": 4}, {"epochs": 0}, {"unroll": 0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"num_envs": 10, "num_minibatches": 4}, {"num_updates_per_batch": 0}, {"unroll_length": 0}],
+)
 def test_settings_that_make_no_ppo_are_refused(wrong: dict) -> None:
     with pytest.raises(BadInput, match=r"minibatches|at least 1"):
         PPO(**wrong)
@@ -453,4 +487,4 @@ def test_settings_that_make_no_ppo_are_refused(wrong: dict) -> None:
 
 def test_settings_that_make_no_sampling_are_refused() -> None:
     with pytest.raises(BadInput, match="at least 1"):
-        RandomActions(lanes=0)
+        RandomActions(num_envs=0)

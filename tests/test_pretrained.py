@@ -16,7 +16,7 @@ import pytest
 
 from genidm.controller import PRETRAINED, load, pretrained
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test, evaluate
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.files import load_json, verify
 from genidm.robots import ROBOTS, Ant
@@ -42,18 +42,18 @@ def away(way: jax.Array) -> jax.Array:
     return -way
 
 
-def changed(change: Change, steering: Any, s: jax.Array, way: jax.Array) -> jax.Array:
-    return steering(s, change(way))
+def changed(change: Change, controller: Any, s: jax.Array, way: jax.Array) -> jax.Array:
+    return controller(s, change(way))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_steers_the_robot_that_it_is_named_after(name: str) -> None:
-    steering = pretrained(name)
-    robot = steering.robot
+    controller = pretrained(name)
+    robot = controller.robot
     assert robot.name == name == load_json(PRETRAINED / name / "done.json")["robot"]
     state = jax.jit(robot.reset)(jax.random.split(jax.random.key(0), 4), jnp.zeros(4))
     left, right = (jnp.tile(jnp.asarray([0.5, y, 0.0]), (4, 1)) for y in (3.0, -3.0))
-    actions = np.asarray([steering(state.observation, way) for way in (left, right)])
+    actions = np.asarray([controller(state.observation, way) for way in (left, right)])
     assert np.isfinite(actions).all() and np.abs(actions).max() <= 1
     assert np.abs(actions[0] - actions[1]).max() > 0.05  # it minds where it is to go
 
@@ -65,11 +65,17 @@ def test_it_steers_the_robot_that_it_is_named_after(name: str) -> None:
 def closest(change: Change = kept) -> np.ndarray:
     """Closest distance `[48]`, metres, of the Ant's controller, told another way to the target."""
     ant = Ant(engine="mujoco")
-    steering = jax.tree_util.Partial(
+    controller = jax.tree_util.Partial(
         functools.partial(changed, change), load(PRETRAINED / "ant", ant)
     )
-    bank = scenarios(ant, seeds=2, episodes=24)
-    return evaluate(ant, steering, bank, Test(max_steps=300, lanes=48), quiet=True).closest
+    tested_scenarios = scenarios(ant, seeds=2, episodes=24)
+    return evaluate(
+        ant,
+        controller,
+        tested_scenarios,
+        EvaluationSettings(max_steps=300, num_envs=48),
+        quiet=True,
+    ).closest
 
 
 def test_the_ant_goes_to_its_targets() -> None:

@@ -17,7 +17,7 @@ from tensorboardX.event_file_writer import EventsWriter
 
 from genidm import progress
 from genidm.errors import BadInput
-from genidm.progress import Progress, compiled, read_metrics
+from genidm.progress import Progress, compile_ahead, read_metrics
 
 
 def events(directory: Path) -> dict[str, list[tuple[int, float]]]:
@@ -91,12 +91,12 @@ def test_lines_are_there_before_the_end(tmp_path: Path, monkeypatch) -> None:
         assert points(tmp_path) == events(tmp_path)["loss"] == [(1, 1.0)]
 
 
-def test_torn_metrics(tmp_path: Path) -> None:
+def test_corrupt_metrics(tmp_path: Path) -> None:
     file = tmp_path / "metrics.jsonl"
     file.write_text('{"step": 1, "loss": 1}\n{"step": 2, "lo')
     assert read_metrics(file) == [{"step": 1, "loss": 1}]
     file.write_text('{"step": 1, "lo\n{"step": 2, "loss": 1}\n')
-    with pytest.raises(BadInput, match="torn in line 1"):
+    with pytest.raises(BadInput, match="corrupt in line 1"):
         read_metrics(file)
     with pytest.raises(BadInput, match="cannot use"):
         read_metrics(tmp_path / "nowhere.jsonl")
@@ -153,7 +153,7 @@ def test_compiling_is_timed_apart(capfd) -> None:
         traces.append(x)
         return 2 * x
 
-    program = compiled("doubling", jax.jit(double), jnp.ones(3))
+    program = compile_ahead("doubling", jax.jit(double), jnp.ones(3))
     assert re.search(r"doubling: program ready in \d+(\.\d)? s\n", capfd.readouterr().err)
     np.testing.assert_array_equal(program(jnp.arange(3.0)), [0, 2, 4])
     assert len(traces) == 1

@@ -7,11 +7,11 @@ import pytest
 
 from genidm.agents.frozen import Frozen
 from genidm.agents.random import RandomActions
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import scenarios
 from genidm.paper import protocol
 from genidm.paper.fit import Fit
-from genidm.paper.methods import TABLES, Direct, Inverse, by_name, literal
+from genidm.paper.methods import TABLES, GoalConditioned, InverseDynamics, by_name, paper_settings
 from genidm.robots import ROBOTS, Ant
 from genidm.runs.scale import scale_of
 
@@ -66,9 +66,12 @@ def test_methods_are_those_of_table_2(robot: str, name: str, layers: dict, algor
         assert isinstance(agent, RandomActions)
     else:
         assert type(agent).__name__ == algorithm
-        assert not isinstance(agent, RandomActions) and agent.hidden == layers["Policy"]
-    assert isinstance(method, Inverse) == ("IDM" in layers)
-    if isinstance(method, Inverse):
+        assert (
+            not isinstance(agent, RandomActions)
+            and agent.policy_hidden_layer_sizes == layers["Policy"]
+        )
+    assert isinstance(method, InverseDynamics) == ("IDM" in layers)
+    if isinstance(method, InverseDynamics):
         assert method.fit.idm == layers["IDM"]
         assert (method.fit.latent_size is not None) == ("LFM" in layers)
         assert "LFM" not in layers or method.fit.lfm == layers["LFM"]
@@ -81,31 +84,35 @@ def test_methods_are_those_of_table_2(robot: str, name: str, layers: dict, algor
 def test_a_1_2(robot: str, millions: int, learned_from: float, k: int) -> None:
     assert ROBOTS[robot].paper_interactions == millions * 10**6
     rl, ge, lr = (by_name(name, robot) for name in ("RL", "GE", "LR"))
-    assert isinstance(rl, Inverse) and isinstance(ge, Inverse) and isinstance(lr, Inverse)
+    assert (
+        isinstance(rl, InverseDynamics)
+        and isinstance(ge, InverseDynamics)
+        and isinstance(lr, InverseDynamics)
+    )
     frozen = isinstance(lr.agent, Frozen)
     assert frozen == (robot == "humanoid")
-    before = lr.agent.share * millions if isinstance(lr.agent, Frozen) else 0.0
+    before = lr.agent.fraction * millions if isinstance(lr.agent, Frozen) else 0.0
     assert before == pytest.approx(5.0 if frozen else 0.0)
-    assert (rl.share, rl.generalize) == (1.0, None)
+    assert (rl.fraction, rl.generalize) == (1.0, None)
     for method in (ge, lr):
         assert method.generalize
-        assert method.share * (millions - before) == pytest.approx(learned_from)
+        assert method.fraction * (millions - before) == pytest.approx(learned_from)
     assert lr.fit.latent_size == k
 
 
 def test_every_fit_is_adam_at_1e_3_on_minibatches_of_512_and_lambda_is_a_quarter() -> None:
-    fits = [m.fit for column in TABLES.values() for m in column if isinstance(m, Inverse)]
-    assert {(fit.batch, fit.learning_rate) for fit in (*fits, Fit())} == {(512, 1e-3)}
+    fits = [m.fit for column in TABLES.values() for m in column if isinstance(m, InverseDynamics)]
+    assert {(fit.batch_size, fit.learning_rate) for fit in (*fits, Fit())} == {(512, 1e-3)}
     for column in TABLES.values():
-        papers = [literal(m) for m in column if isinstance(m, Inverse)]
-        assert {(m.fit.latent_weight, m.fit.averaged, m.fit.decay) for m in papers} == {
-            (0.25, True, False)
-        }
-        assert {m.look_ahead for m in papers} == {1}
+        papers = [paper_settings(m) for m in column if isinstance(m, InverseDynamics)]
+        assert {
+            (m.fit.latent_loss_weight, m.fit.mean_latent, m.fit.cosine_decay) for m in papers
+        } == {(0.25, True, False)}
+        assert {m.goal_horizon for m in papers} == {1}
 
 
 def test_a_1_3() -> None:
-    assert Test().max_steps == 1000
+    assert EvaluationSettings().max_steps == 1000
     paper = scale_of("paper", 1)
     assert (paper.seeds, paper.episodes) == (10, 1000)
     ranges = {name: robot.target_distance for name, robot in ROBOTS.items()}
@@ -113,20 +120,29 @@ def test_a_1_3() -> None:
         "ant": (2, 5), "humanoid": (2, 5), "humanoid_world": (2, 5), "minitaur": (1.5, 2.5),
     }  # fmt: skip
     robot = Ant(engine="mujoco")
-    bank = scenarios(robot, 2, 200)
-    start = robot.reset(bank.keys.reshape(-1), bank.yaw.reshape(-1))
-    way = np.asarray(bank.target.reshape(-1, 3) - start.position)[:, :2]
+    tested_scenarios = scenarios(robot, 2, 200)
+    start = robot.reset(tested_scenarios.keys.reshape(-1), tested_scenarios.yaw.reshape(-1))
+    way = np.asarray(tested_scenarios.target.reshape(-1, 3) - start.position)[:, :2]
     distance = np.linalg.norm(way, axis=-1)
     assert 2 - 1e-4 < distance.min() < 2.2 and 4.8 < distance.max() < 5 + 1e-4
     bearing = np.angle(np.exp(1j * (np.arctan2(way[:, 1], way[:, 0]) - np.asarray(start.heading))))
     assert 40 < np.degrees(np.abs(bearing)).max() < 45.01
-    assert np.degrees(np.asarray(bank.yaw)).min() < -170 < 170 < np.degrees(bank.yaw).max()
+    assert (
+        np.degrees(np.asarray(tested_scenarios.yaw)).min()
+        < -170
+        < 170
+        < np.degrees(tested_scenarios.yaw).max()
+    )
 
 
 def test_a_column_has_the_papers_rows_and_one_more() -> None:
     paper = ["RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR"]
     for column in TABLES.values():
         assert [m.name for m in column] == [*paper, "HF"]
-        assert [m.name for m in column if isinstance(m, Direct)] == ["VGCP", "HER_SP", "HER_DE"]
+        assert [m.name for m in column if isinstance(m, GoalConditioned)] == [
+            "VGCP",
+            "HER_SP",
+            "HER_DE",
+        ]
     for table in (protocol.TABLE1, protocol.TABLE2):
         assert {tuple(rows) for rows in table.values()} == {tuple(paper)}

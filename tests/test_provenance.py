@@ -26,7 +26,7 @@ COLLECT = "genidm.agents.collect"
 
 def test_code_is_what_is_imported_one_through_another() -> None:
     code = code_of(COLLECT, PPO(), ROBOT, ROBOT.engine)
-    for name in ("agents.ppo", "agents.walking", "rollout", "tasks", "robots.ant", "symmetry"):
+    for name in ("agents.ppo", "agents.unroll", "rollout", "tasks", "robots.ant", "symmetry"):
         assert f"genidm.{name}" in code
     assert {"genidm.robots.mujoco", "genidm.robots.base", "genidm.engines.mujoco"} < code.keys()
     others = ("agents.sac", "robots.humanoid", "engines.mjx", "paper.fit", "report.table")

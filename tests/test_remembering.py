@@ -1,4 +1,4 @@
-"""A buffer's rows are written once, and come back bit by bit, whatever is torn or killed."""
+"""A buffer's rows are written once, and come back bit by bit, whatever is corrupt or killed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from killing import Killed
 from test_buffer import LANES, ROWS, UNROLL, filled
 
 from genidm import files
-from genidm.agents.buffer import Buffer, empty, insert
+from genidm.agents.buffer import Buffer, add, empty
 from genidm.agents.remembering import Remembering
 from genidm.checkpoints import Checkpoints
 from genidm.errors import BadInput
@@ -106,7 +106,7 @@ def test_a_tree_without_a_buffer_has_no_parts(tmp_path: Path) -> None:
     )
 
 
-def test_a_torn_part_gives_way_to_the_checkpoint_before(tmp_path: Path, capsys) -> None:
+def test_a_corrupt_part_gives_way_to_the_checkpoint_before(tmp_path: Path, capsys) -> None:
     saved(tmp_path, [3, 5, 6])
     newest = sorted(tmp_path.glob("part_*"))[-1]
     harmed = [newest / name for name in ("s.npy", "last.npy", "manifest.json")]
@@ -128,7 +128,7 @@ def test_a_torn_part_gives_way_to_the_checkpoint_before(tmp_path: Path, capsys) 
     same(found(tmp_path), (6, tree(6)))
 
 
-def test_a_torn_part_of_both_checkpoints_is_said(tmp_path: Path, capsys) -> None:
+def test_a_corrupt_part_of_both_checkpoints_is_said(tmp_path: Path, capsys) -> None:
     saved(tmp_path, [3, 5, 6])
     flip(sorted(tmp_path.glob("part_*"))[0] / "a.npy")
     assert found(tmp_path) is None
@@ -160,9 +160,9 @@ def test_a_part_made_anew_is_not_taken_for_the_one_before(tmp_path: Path) -> Non
 def test_a_buffer_of_another_size_is_refused(tmp_path: Path) -> None:
     saved(tmp_path, [3])
     rows = LIKE["learner"]["buffer"].rows
-    for capacity in (ROWS * LANES // 2, 2 * ROWS * LANES):
+    for max_replay_size in (ROWS * LANES // 2, 2 * ROWS * LANES):
         part = rows.replace(**{k: x[:UNROLL] for k, x in vars(rows).items()})
-        like = {**LIKE, "learner": {**LIKE["learner"], "buffer": empty(part, capacity)}}
+        like = {**LIKE, "learner": {**LIKE["learner"], "buffer": empty(part, max_replay_size)}}
         with pytest.raises(BadInput, match=r"rows/a is float32\[0, 12, 5, 1\] there"):
             Remembering(Checkpoints(tmp_path)).latest(like)
 
@@ -213,14 +213,14 @@ def test_killed_at_any_moment_old_or_new_is_there(tmp_path: Path, monkeypatch) -
 
 LOOP = """
 import sys, numpy as np
-from genidm.agents.buffer import Buffer, Memory
+from genidm.agents.buffer import Buffer, ReplayTransition
 from genidm.agents.remembering import Remembering
 from genidm.checkpoints import Checkpoints
 remembering, rows = Remembering(Checkpoints(sys.argv[1])), np.zeros((100, 20), np.int32)
 for step in range(1, 10**6):
     new = np.arange((step - 1) * 30, step * 30)
     rows[new % 100] = new[:, None]
-    memory = Memory(**dict.fromkeys(Memory.__dataclass_fields__, rows.copy()))
+    memory = ReplayTransition(**dict.fromkeys(ReplayTransition.__dataclass_fields__, rows.copy()))
     remembering.save(step, {"buffer": Buffer(memory, np.int32(step * 30)), "n": step})
     print(step, flush=True)
 """
@@ -256,4 +256,4 @@ def test_what_is_inserted_after_a_resume_lies_where_it_would(tmp_path: Path) -> 
     buffer, part = back["learner"]["buffer"], filled(6)[0].rows
     at = np.arange(5 * UNROLL, 6 * UNROLL) % ROWS
     new = part.replace(**{k: jnp.asarray(x)[at] for k, x in vars(part).items()})
-    same(insert(buffer, new), filled(6)[0])
+    same(add(buffer, new), filled(6)[0])

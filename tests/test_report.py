@@ -54,7 +54,7 @@ def outcome(mean: float, rng: int = 0, seeds: int = 4, episodes: int = 50) -> Ep
 def row(method: str, seeds: int = 1, **changes) -> report.Row:
     runs = {seed: outcome(METHODS.get(method, 1.5), seed) for seed in range(seeds)}
     replayed = 1_000_000 if method in ("GE", "LR") else 0
-    settings = {"latent_weight": np.float32(0.25), "hidden": (50, 50), "k": np.int64(10)}
+    settings = {"latent_loss_weight": np.float32(0.25), "hidden": (50, 50), "k": np.int64(10)}
     this = report.Row(method, runs[0], 2_000_000, replayed, settings, runs)
     return dataclasses.replace(this, **changes)
 
@@ -80,7 +80,11 @@ def test_results_have_the_schema(rows):
         assert set(method["success"]) == {"0.25", "0.5", "1.0"}
         low, high = method["ci95"]
         assert low < method["mean"] < high
-    assert r["methods"]["LR"]["settings"] == {"latent_weight": 0.25, "hidden": [50, 50], "k": 10}
+    assert r["methods"]["LR"]["settings"] == {
+        "latent_loss_weight": 0.25,
+        "hidden": [50, 50],
+        "k": 10,
+    }
     assert r["methods"]["LR"]["replayed"] == 1_000_000
 
 
@@ -234,7 +238,7 @@ def test_the_paper_has_no_other_robots(rows):
 
 
 def test_the_text_fits_a_terminal_and_is_aligned(rows):
-    lines = report.text(document([*rows, row("LR literal", 3)])).splitlines()
+    lines = report.text(document([*rows, row("LR paper", 3)])).splitlines()
     assert max(map(len, lines)) <= 120
     body = lines[4 : 4 + len(METHODS)]
     assert [line.split()[0] for line in body] == list(METHODS)

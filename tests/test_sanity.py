@@ -13,17 +13,23 @@ from point import Point, Straight
 
 from genidm import symmetry
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluate import Test, evaluate, trace
+from genidm.evaluation.evaluate import EvaluationSettings, evaluate, trace
 from genidm.evaluation.sanity import heeds, walked
-from genidm.evaluation.scenarios import TOUR, scenarios, tours
+from genidm.evaluation.scenarios import FIG8_EPISODES, fig8_scenarios, scenarios
 
 ROBOT = Point()
 
 
 @pytest.mark.parametrize(("pace", "share"), [(1.0, 1.0), (0.0, 0.0), (0.02, 0.08), (-1.0, None)])
 def test_how_far_it_walks_is_told_and_that_it_does_not(pace: float, share, capsys) -> None:
-    bank = scenarios(ROBOT, 1, 20)
-    found = evaluate(ROBOT, Straight(jnp.float32(pace), ROBOT), bank, Test(300), quiet=True)
+    tested_scenarios = scenarios(ROBOT, 1, 20)
+    found = evaluate(
+        ROBOT,
+        Straight(jnp.float32(pace), ROBOT),
+        tested_scenarios,
+        EvaluationSettings(300),
+        quiet=True,
+    )
     capsys.readouterr()
     got = walked("LR", found)["walked"]
     expected = found.path_length.mean() / found.start.mean()
@@ -52,10 +58,10 @@ class Elsewhere(flax.struct.PyTreeNode):
     spread: jax.Array
     straight: Straight
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        a = self.straight(s, displacement)
-        angle = self.spread * jnp.sin(1e4 * displacement[:, 0].sum() + 1e4 * displacement[:, 1])
-        return symmetry.turn_vector(a, angle)
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        a = self.straight(s, relative_goal)
+        angle = self.spread * jnp.sin(1e4 * relative_goal[:, 0].sum() + 1e4 * relative_goal[:, 1])
+        return symmetry.rotate_vector(a, angle)
 
 
 class Ahead(flax.struct.PyTreeNode):
@@ -63,8 +69,8 @@ class Ahead(flax.struct.PyTreeNode):
 
     pace: jax.Array
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
-        return jnp.zeros_like(displacement).at[:, 0].set(self.pace)
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        return jnp.zeros_like(relative_goal).at[:, 0].set(self.pace)
 
 
 TO_THE_TARGET = Straight(jnp.float32(1.0), ROBOT)
@@ -81,15 +87,15 @@ TO_THE_TARGET = Straight(jnp.float32(1.0), ROBOT)
     ids=["to the target", "slowly", "ahead", "still", "at random", "away"],
 )  # fmt: skip
 def test_whether_it_minds_where_it_is_to_go_is_told(controller, minds: bool, capsys) -> None:
-    walks = tours(ROBOT)
-    _, ways = trace(ROBOT, controller, walks, Test(200))
+    walks = fig8_scenarios(ROBOT)
+    _, ways = trace(ROBOT, controller, walks, EvaluationSettings(200))
     capsys.readouterr()
     target = np.asarray(walks.target)
     found, said = heeds("HF", ways, target)["heeds"], capsys.readouterr().err
     assert ("warning: HF hardly heeds where it is to go" in said) == (not minds), found
-    bearing = np.linspace(-np.pi / 4, np.pi / 4, TOUR)
-    pairs = np.cos(bearing[:, None] - bearing).sum() - TOUR
+    bearing = np.linspace(-np.pi / 4, np.pi / 4, FIG8_EPISODES)
+    pairs = np.cos(bearing[:, None] - bearing).sum() - FIG8_EPISODES
     if minds:  # each way is that to its own target
-        assert found == pytest.approx(1 - pairs / (TOUR * (TOUR - 1)), abs=0.01)
+        assert found == pytest.approx(1 - pairs / (FIG8_EPISODES * (FIG8_EPISODES - 1)), abs=0.01)
     if isinstance(controller, Ahead):
         assert found == pytest.approx(0, abs=0.01)

@@ -18,8 +18,8 @@ from killing import Killed
 from test_config import Config, Other
 
 from genidm import files, store
-from genidm.config import digest, plain
-from genidm.files import Torn, load_json
+from genidm.config import digest, to_json
+from genidm.files import Corrupt, load_json
 from genidm.provenance import environment
 from genidm.store import Stage
 
@@ -28,7 +28,7 @@ def test_a_stage_is_found_again_and_knows_whether_it_is_done(tmp_path: Path) -> 
     stage = Stage.open(tmp_path, "collect", Config())
     assert stage.directory == tmp_path / f"collect-{digest(Config())}"
     config = load_json(stage.path("config.json"))
-    assert config["config"] == plain(Config())
+    assert config["config"] == to_json(Config())
     assert config["code"] == {}
     assert not stage.done
     stage.checkpoints().save(3, {"a": 1})
@@ -42,7 +42,7 @@ def test_a_stage_is_found_again_and_knows_whether_it_is_done(tmp_path: Path) -> 
     assert not Stage.open(tmp_path, "collect", Other()).done
 
 
-def test_a_torn_done_is_not_done(tmp_path: Path) -> None:
+def test_a_corrupt_done_is_not_done(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "fit", {})
     stage.finish({"loss": 1.0})
     truncate(stage.path("done.json"))
@@ -58,11 +58,11 @@ def test_a_stage_resumed_elsewhere_warns(tmp_path: Path, monkeypatch, capfd) -> 
 
     for _ in range(2):
         with pytest.raises(Killed):
-            stage.once(dies)
+            stage.run_once(dies)
     assert "warning" not in capfd.readouterr().err
     here = environment()
     monkeypatch.setattr(store, "environment", lambda: {**here, "hardware": "another"})
-    stage.once(lambda: {})
+    stage.run_once(lambda: {})
     assert "bits may differ" in capfd.readouterr().err
     assert [session["hardware"] for session in stage.made] == [here["hardware"]] * 2 + ["another"]
 
@@ -70,7 +70,7 @@ def test_a_stage_resumed_elsewhere_warns(tmp_path: Path, monkeypatch, capfd) -> 
 def test_a_stage_says_who_made_it_and_how_long_it_took(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("sys.argv", ["run me", "--seed", "1"])
     stage = Stage.open(tmp_path, "fit", {})
-    stage.once(lambda: time.sleep(0.2) or {})
+    stage.run_once(lambda: time.sleep(0.2) or {})
     (session,) = stage.made
     assert session["command"].endswith("--seed 1")
     assert {name: session[name] for name in environment()} == environment()
@@ -83,7 +83,7 @@ OLD, NEW = {"genidm.paper.fit": "aaaa"}, {"genidm.paper.fit": "bbbb"}
 
 def test_a_stage_of_other_code_is_made_anew_and_said(tmp_path: Path, capfd) -> None:
     old = Stage.open(tmp_path, "LR-0", {"k": 10}, OLD)
-    old.once(lambda: {"by": "old"})
+    old.run_once(lambda: {"by": "old"})
     assert Stage.open(tmp_path, "LR-0", {"k": 10}, OLD) == old
     assert capfd.readouterr().err == ""
     new = Stage.open(tmp_path, "LR-0", {"k": 10}, NEW)
@@ -92,7 +92,7 @@ def test_a_stage_of_other_code_is_made_anew_and_said(tmp_path: Path, capfd) -> N
     assert f"{old.directory} was made by other code (genidm.paper.fit)" in said
     assert Stage.open(tmp_path, "LR-0", {"k": 11}, NEW).directory not in (old, new)
     assert capfd.readouterr().err == "", "another config is another stage, and no news"
-    new.once(lambda: {"by": "new"})
+    new.run_once(lambda: {"by": "new"})
     assert old.summary() == {"by": "old"}
 
 
@@ -100,10 +100,10 @@ def test_a_stage_of_other_code_is_used_where_the_user_says_so(tmp_path: Path, ca
     old = Stage.open(tmp_path, "LR-0", {"k": 10}, OLD)
     half = Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True)
     assert half != old, "one that is not finished is not used"
-    old.once(lambda: {"by": "old"})
+    old.run_once(lambda: {"by": "old"})
     assert Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True) == old
     assert "warning" in (said := capfd.readouterr().err) and "it is used" in said
-    half.once(lambda: {"by": "new"})
+    half.run_once(lambda: {"by": "new"})
     assert Stage.open(tmp_path, "LR-0", {"k": 10}, NEW, reuse=True) == half
 
 
@@ -121,8 +121,8 @@ def test_work_is_done_once_and_its_checkpoints_go(tmp_path: Path) -> None:
         calls.append(stage.done)
         return {"n": 7}
 
-    stage.once(work)
-    stage.once(work)
+    stage.run_once(work)
+    stage.run_once(work)
     assert calls == [False] and stage.summary() == {"n": 7}
     assert stage.checkpoints().steps() == []
 
@@ -130,9 +130,9 @@ def test_work_is_done_once_and_its_checkpoints_go(tmp_path: Path) -> None:
 def test_work_that_fails_is_not_done_and_can_be_done_again(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "fit", {})
     with pytest.raises(ZeroDivisionError):
-        stage.once(lambda: {"n": 1 // 0})
+        stage.run_once(lambda: {"n": 1 // 0})
     assert not stage.done
-    stage.once(lambda: {"n": 1})
+    stage.run_once(lambda: {"n": 1})
     assert stage.done
 
 
@@ -144,7 +144,7 @@ def work():
     print("at work", flush=True)
     sys.stdin.readline()
     return {"by": "the other"}
-Stage.open(sys.argv[1], "fit", {}).once(work)
+Stage.open(sys.argv[1], "fit", {}).run_once(work)
 """
 
 
@@ -161,7 +161,7 @@ def other(tmp_path: Path) -> Iterator[subprocess.Popen]:
 
 def test_a_stage_that_another_process_does_is_waited_for(tmp_path: Path, other, capfd) -> None:
     stage, calls = Stage.open(tmp_path, "fit", {}), []
-    waiting = threading.Thread(target=stage.once, args=[lambda: calls.append(1) or {}])
+    waiting = threading.Thread(target=stage.run_once, args=[lambda: calls.append(1) or {}])
     waiting.start()
     waiting.join(1)
     assert waiting.is_alive() and not calls
@@ -176,7 +176,7 @@ def test_a_stage_whose_process_was_killed_is_free(tmp_path: Path, other) -> None
     stage = Stage.open(tmp_path, "fit", {})
     other.kill()
     other.wait()
-    stage.once(lambda: {"by": "this"})
+    stage.run_once(lambda: {"by": "this"})
     assert stage.summary() == {"by": "this"}
 
 
@@ -186,22 +186,22 @@ def test_without_locks_work_is_done_all_the_same(tmp_path: Path, monkeypatch) ->
 
     monkeypatch.setattr(fcntl, "flock", none)
     stage = Stage.open(tmp_path, "fit", {})
-    stage.once(lambda: {"n": 1})
+    stage.run_once(lambda: {"n": 1})
     assert stage.done
 
 
-def test_what_is_torn_in_a_stage_says_which_directory_to_delete(tmp_path: Path) -> None:
+def test_what_is_corrupt_in_a_stage_says_which_directory_to_delete(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "fit", {})
     files.save_arrays(stage.path("controller"), {"a": np.ones(3)}, {})
     assert stage.read(files.load_arrays, "controller", True)[1] == {}
     (stage.path("controller") / "a.npy").write_bytes(b"")
     for name in ("controller", "policy"):
-        with pytest.raises(Torn, match=rf"{name}.* Delete {stage.directory} to make it anew$"):
+        with pytest.raises(Corrupt, match=rf"{name}.* Delete {stage.directory} to make it anew$"):
             stage.read(files.load_arrays, name)
 
     def said_already(path: Path) -> None:
-        raise Torn(f"{path} lacks a chunk. Delete {stage.directory} to make it anew")
+        raise Corrupt(f"{path} lacks a chunk. Delete {stage.directory} to make it anew")
 
-    with pytest.raises(Torn) as torn:
+    with pytest.raises(Corrupt) as corrupt:
         stage.read(said_already, "experience")
-    assert str(torn.value).count("Delete") == 1
+    assert str(corrupt.value).count("Delete") == 1

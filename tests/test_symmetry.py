@@ -70,14 +70,14 @@ def same(field: Field, x: jnp.ndarray, y: jnp.ndarray) -> bool:
 @pytest.mark.usefixtures("strict_ranks")
 def test_turns_add_up(field: Field, rng: np.random.Generator) -> None:
     x, a, b = sample(rng, field), angles(rng), angles(rng)
-    assert same(field, field.turn(field.turn(x, a), b), field.turn(x, a + b))
+    assert same(field, field.rotate(field.rotate(x, a), b), field.rotate(x, a + b))
 
 
 @each_field
 @pytest.mark.usefixtures("strict_ranks")
 def test_a_turn_by_nothing_changes_nothing(field: Field, rng: np.random.Generator) -> None:
     x = sample(rng, field)
-    turned = field.turn(x, jnp.zeros(LANES))
+    turned = field.rotate(x, jnp.zeros(LANES))
     assert same(field, turned, x) if field is EULER else np.array_equal(turned, x)
 
 
@@ -90,23 +90,23 @@ def test_two_reflections_cancel(field: Field, rng: np.random.Generator) -> None:
 @each_field
 def test_a_reflection_reverses_turns(field: Field, rng: np.random.Generator) -> None:
     x, yaw = sample(rng, field), angles(rng)
-    assert same(field, field.mirror(field.turn(x, yaw)), field.turn(field.mirror(x), -yaw))
+    assert same(field, field.mirror(field.rotate(x, yaw)), field.rotate(field.mirror(x), -yaw))
 
 
 def test_what_is_seen_along_the_heading_mirrors_as_the_world_does(rng: np.random.Generator) -> None:
     """x ahead, y to the left: seen along the mirrored heading, y alone changes its sign."""
     in_world, yaw = jnp.asarray(rng.normal(size=(LANES, 3))), angles(rng)
     field = symmetry.heading_vector("velocity")
-    seen = symmetry.turn_vector(in_world, -yaw)
-    across = symmetry.turn_vector(in_world * np.asarray([1, -1, 1]), yaw)
+    seen = symmetry.rotate_vector(in_world, -yaw)
+    across = symmetry.rotate_vector(in_world * np.asarray([1, -1, 1]), yaw)
     assert np.allclose(field.mirror(seen), across, atol=1e-5)
 
 
 @each_field
 def test_a_batch_is_its_lanes(field: Field, rng: np.random.Generator) -> None:
     x, yaw = sample(rng, field), angles(rng)
-    one = [(field.turn(x[i], yaw[i]), field.mirror(x[i])) for i in range(3)]
-    batch = field.turn(x, yaw), field.mirror(x)
+    one = [(field.rotate(x[i], yaw[i]), field.mirror(x[i])) for i in range(3)]
+    batch = field.rotate(x, yaw), field.mirror(x)
     for i, (turned, mirrored) in enumerate(one):
         assert np.allclose(turned, batch[0][i], atol=1e-6) and np.array_equal(mirrored, batch[1][i])
 
@@ -114,7 +114,7 @@ def test_a_batch_is_its_lanes(field: Field, rng: np.random.Generator) -> None:
 @each_field
 def test_kinds_say_whether_a_turn_is_seen(field: Field, rng: np.random.Generator) -> None:
     x = sample(rng, field)
-    moved = not np.allclose(field.turn(x, jnp.ones(LANES)), x)
+    moved = not np.allclose(field.rotate(x, jnp.ones(LANES)), x)
     assert moved == (field.kind in ("vector", "quaternion", "wrenches", "Euler angles"))
 
 
@@ -124,25 +124,27 @@ def test_kinds_say_whether_a_turn_is_seen(field: Field, rng: np.random.Generator
 def test_vectors_turn_as_scipy_turns_them(rng: np.random.Generator) -> None:
     v, yaw = rng.normal(size=(LANES, 3)), angles(rng)
     expected = about_z(yaw).apply(v)
-    assert np.allclose(symmetry.turn_vector(jnp.asarray(v), yaw), expected, atol=1e-5)
+    assert np.allclose(symmetry.rotate_vector(jnp.asarray(v), yaw), expected, atol=1e-5)
 
 
 def test_one_vector_turns_by_many_yaws(rng: np.random.Generator) -> None:
     v, yaw = rng.normal(size=3), angles(rng)
     expected = about_z(yaw).apply(v)
-    assert np.allclose(symmetry.turn_vector(jnp.asarray(v), yaw), expected, atol=1e-5)
+    assert np.allclose(symmetry.rotate_vector(jnp.asarray(v), yaw), expected, atol=1e-5)
 
 
 def test_quaternions_turn_as_scipy_turns_them(rng: np.random.Generator) -> None:
     q, yaw = sample(rng, FIELDS[3]), angles(rng)
     expected = (about_z(yaw) * rotation(q)).as_quat(scalar_first=True)
-    assert np.allclose(symmetry.turn_quaternion(q, yaw), canonical(expected), atol=1e-5)
+    assert np.allclose(symmetry.rotate_quaternion(q, yaw), canonical(expected), atol=1e-5)
 
 
 def test_quaternions_are_given_with_positive_w(rng: np.random.Generator) -> None:
     q = sample(rng, FIELDS[3])
-    assert np.array_equal(symmetry.positive(-q), q) and np.array_equal(symmetry.positive(q), q)
-    assert (symmetry.turn_quaternion(-q, angles(rng))[:, 0] >= 0).all()
+    assert np.array_equal(symmetry.canonical_quaternion(-q), q) and np.array_equal(
+        symmetry.canonical_quaternion(q), q
+    )
+    assert (symmetry.rotate_quaternion(-q, angles(rng))[:, 0] >= 0).all()
 
 
 def test_heading_is_where_the_body_points(rng: np.random.Generator) -> None:
@@ -153,7 +155,7 @@ def test_heading_is_where_the_body_points(rng: np.random.Generator) -> None:
 
 def test_heading_turns_with_the_world(rng: np.random.Generator) -> None:
     q, yaw = sample(rng, FIELDS[3]), angles(rng)
-    change = symmetry.yaw_of(symmetry.turn_quaternion(q, yaw)) - symmetry.yaw_of(q)
+    change = symmetry.yaw_of(symmetry.rotate_quaternion(q, yaw)) - symmetry.yaw_of(q)
     assert np.allclose(symmetry.wrap(change - yaw + 1.0), 1.0, atol=1e-4)
     assert np.allclose(symmetry.yaw_of(FIELDS[3].mirror(q)), -symmetry.yaw_of(q), atol=1e-6)
 
@@ -185,7 +187,7 @@ def test_torques_transform_as_arm_times_force(rng: np.random.Generator) -> None:
 
     contact = FIELDS[5]
     expected = wrench(turned(arm), turned(force))
-    assert np.allclose(contact.turn(wrench(arm, force), yaw), expected, atol=1e-5)
+    assert np.allclose(contact.rotate(wrench(arm, force), yaw), expected, atol=1e-5)
     expected = wrench(mirrored(arm), mirrored(force))
     assert np.allclose(contact.mirror(wrench(arm, force)), expected, atol=1e-5)
 
@@ -211,8 +213,8 @@ def test_angles_are_those_of_scipy(rng: np.random.Generator) -> None:
     q, yaw = sample(rng, FIELDS[3]), angles(rng)
     expected = rotation(q).as_euler("ZYX")[:, ::-1]
     assert np.allclose(symmetry.euler_of(q), expected, atol=1e-4)
-    turned = symmetry.euler_of(symmetry.turn_quaternion(q, yaw))
-    assert same(EULER, EULER.turn(symmetry.euler_of(q), yaw), turned)
+    turned = symmetry.euler_of(symmetry.rotate_quaternion(q, yaw))
+    assert same(EULER, EULER.rotate(symmetry.euler_of(q), yaw), turned)
     mirrored = symmetry.euler_of(FIELDS[3].mirror(q))
     assert same(EULER, EULER.mirror(symmetry.euler_of(q)), mirrored)
 
@@ -226,7 +228,7 @@ def test_wrap_brings_angles_into_one_turn() -> None:
 
 
 def test_horizontal_leaves_height_out() -> None:
-    assert symmetry.horizontal(jnp.array([3.0, 4.0, 100.0])) == 5.0
+    assert symmetry.horizontal_norm(jnp.array([3.0, 4.0, 100.0])) == 5.0
 
 
 # ── layouts ─────────────────────────────────────────────────────────────────────────────────
@@ -240,11 +242,11 @@ def layout() -> Layout:
 def test_a_layout_is_its_fields(layout: Layout, rng: np.random.Generator) -> None:
     parts, yaw = [sample(rng, f) for f in FIELDS], angles(rng)
     x = jnp.concatenate(parts, axis=-1)
-    turned, mirrored = layout.turn(x, yaw), layout.mirror(x)
+    turned, mirrored = layout.rotate(x, yaw), layout.mirror(x)
     assert layout.size == x.shape[-1] == 33
     for field, part in zip(FIELDS, parts, strict=True):
         assert np.array_equal(layout.part(x, field.name), part)
-        assert np.array_equal(layout.part(turned, field.name), field.turn(part, yaw))
+        assert np.array_equal(layout.part(turned, field.name), field.rotate(part, yaw))
         assert np.array_equal(layout.part(mirrored, field.name), field.mirror(part))
     assert np.array_equal(layout.yaw(x), symmetry.yaw_of(parts[3]))
 
@@ -262,7 +264,7 @@ def test_a_layout_refuses_names_given_twice() -> None:
 
 
 def test_a_layout_refuses_other_sizes(layout: Layout) -> None:
-    for use in (layout.mirror, layout.yaw, lambda x: layout.turn(x, 0.0)):
+    for use in (layout.mirror, layout.yaw, lambda x: layout.rotate(x, 0.0)):
         with pytest.raises(ValueError, match="expected 33 numbers, not 32"):
             use(jnp.zeros((LANES, 32)))
 

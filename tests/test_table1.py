@@ -30,8 +30,8 @@ from genidm.report import shown
 from genidm.report.runs import Tested
 from genidm.runs import cell as cell_module
 from genidm.runs import run as run_module
-from genidm.runs.cell import bank_of, cell
-from genidm.runs.command import guarded
+from genidm.runs.cell import make_run, scenarios_of
+from genidm.runs.command import run_cli
 
 # One record for all that learn from one, and one policy.
 RECORD = dict(agent=AGENTS[RandomActions])
@@ -42,7 +42,14 @@ METHODS = [
 
 
 def options(out: Path, **changes) -> Table:
-    this = Table(scale="0.25", out=out / "runs", episodes=2, seeds=2, spread_episodes=1, test=TEST)
+    this = Table(
+        scale="0.25",
+        run_dir=out / "runs",
+        episodes=2,
+        seeds=2,
+        episodes_per_extra_seed=1,
+        test=TEST,
+    )
     return dataclasses.replace(this, **{"results": out / "results", **changes})
 
 
@@ -116,12 +123,12 @@ def test_table1_has_the_papers_seven_methods_and_its_rows_one_more() -> None:
 def test_methods_are_chosen_by_name() -> None:
     assert chosen(Table()) == list(methods.ANT)
     assert chosen(Table(robot="humanoid")) == list(methods.HUMANOID)
-    assert chosen(Table(extra=False)) == list(methods.ANT[:-1])
+    assert chosen(Table(include_hf=False)) == list(methods.ANT[:-1])
     assert chosen(Table(methods=("LR", "RS", "LR"))) == [methods.LR, methods.RS]
     with pytest.raises(BadInput, match="'XX'; there are: RS"):
         chosen(Table(methods=("RS", "XX")))
     with pytest.raises(BadInput, match="no method to run"):
-        chosen(Table(methods=("HF",), extra=False))
+        chosen(Table(methods=("HF",), include_hf=False))
 
 
 def test_methods_with_one_experience_follow_each_other() -> None:
@@ -131,12 +138,12 @@ def test_methods_with_one_experience_follow_each_other() -> None:
 
 def test_the_later_seeds_are_tested_on_the_beginning_of_the_bank(tmp_path: Path) -> None:
     todo = work(Point(), METHODS, options(tmp_path, seed=3, seeds=3))
-    assert [item.cell.seed for item in todo] == [3] * 4 + [4] * 4 + [5] * 4
-    assert [item.bank.shape for item in todo] == [(10, 2)] * 4 + [(10, 1)] * 8
-    whole, part = todo[0].bank, todo[-1].bank
+    assert [item.run.seed for item in todo] == [3] * 4 + [4] * 4 + [5] * 4
+    assert [item.scenarios.shape for item in todo] == [(10, 2)] * 4 + [(10, 1)] * 8
+    whole, part = todo[0].scenarios, todo[-1].scenarios
     assert np.array_equal(whole.target[:, :1], part.target)
-    all_alike = work(Point(), METHODS, options(tmp_path, spread_episodes=7))
-    assert {item.bank.shape for item in all_alike} == {(10, 2)}
+    all_alike = work(Point(), METHODS, options(tmp_path, episodes_per_extra_seed=7))
+    assert {item.scenarios.shape for item in all_alike} == {(10, 2)}
 
 
 def test_every_method_with_every_seed_has_been_tested_once(finished: Path) -> None:
@@ -153,16 +160,16 @@ def test_what_is_done_is_not_done_again(copy: Path) -> None:
     before = written()
     names = ("collect", "replay", "fit", "run")
     with counted(*names) as calls, pytest.MonkeyPatch.context() as m:
-        m.setattr(table1, "write_report", lambda this, bank, options, own: copy)
+        m.setattr(table1, "write_report", lambda this, tested_scenarios, options, own: copy)
         run(Point(), METHODS, options(copy))
     assert not calls
     assert written() == before
 
 
 def test_a_whole_test_of_a_later_seed_stands_whoever_made_it(copy: Path) -> None:
-    """A lone command tests on the whole bank; the table then asks for no other test."""
-    alone = cell(Point(), METHODS[2], options(copy, seed=1))
-    whole = alone.episodes(bank_of(alone, options(copy)))
+    """A lone command tests on all scenarios; the table then asks for no other test."""
+    alone = make_run(Point(), METHODS[2], options(copy, seed=1))
+    whole = alone.run_test(scenarios_of(alone, options(copy)))
     with counted("run") as calls:
         run(Point(), METHODS, options(copy))
     assert not calls
@@ -173,12 +180,12 @@ def test_a_whole_test_of_a_later_seed_stands_whoever_made_it(copy: Path) -> None
 
 def test_a_commands_own_test_is_its_row(copy: Path) -> None:
     """A, then B of the same name, then A again: the row is A's."""
-    a, b = METHODS[2], dataclasses.replace(METHODS[2], look_ahead=2)
+    a, b = METHODS[2], dataclasses.replace(METHODS[2], goal_horizon=2)
     rows = {}
     for name, method in (("a", a), ("b", b), ("a again", a)):
         run(Point(), [method], options(copy, seeds=1))
         rows[name] = results(copy)["methods"]["RS"]
-    assert rows["a"]["settings"]["look_ahead"] != rows["b"]["settings"]["look_ahead"] == 2
+    assert rows["a"]["settings"]["goal_horizon"] != rows["b"]["settings"]["goal_horizon"] == 2
     assert rows["a again"] == rows["a"]
 
 
@@ -237,7 +244,7 @@ def test_without_a_record_there_is_no_figure_of_invariance(copy: Path) -> None:
     for stage in stages(copy, "experience-*"):
         shutil.rmtree(stage)
     shutil.rmtree(copy / "runs" / "point" / "report-0.25")
-    report, failures = run(Point(), METHODS, options(copy, seeds=1, results=None))
+    report, failures = run(Point(), METHODS, options(copy, seeds=1, report_dir=None))
     assert report and not failures
     names = {path.name for path in report.glob("*.png")}
     assert not names & {"invariance.png", "collecting.png"} and "paths.png" in names
@@ -253,14 +260,14 @@ def test_without_a_record_there_is_no_figure_of_invariance(copy: Path) -> None:
 def failing(monkeypatch) -> dict[str, Exception]:
     """Method → what its cells fail with."""
     wrong: dict[str, Exception] = {}
-    episodes = run_module.Cell.episodes
+    episodes = run_module.Run.run_test
 
     def failing(self, *args):
         if self.method.name in wrong:
             raise wrong[self.method.name]
         return episodes(self, *args)
 
-    monkeypatch.setattr(run_module.Cell, "episodes", failing)
+    monkeypatch.setattr(run_module.Run, "run_test", failing)
     return wrong
 
 
@@ -306,7 +313,7 @@ def command(monkeypatch, *flags: str) -> int:
     """The exit status of `python -m experiments.table1`."""
     monkeypatch.setattr(sys, "argv", ["table1", *flags])
     try:
-        guarded(table1.table1, "")
+        run_cli(table1.table1, "")
     except SystemExit as end:
         return int(end.code or 0)
     return 0
@@ -317,15 +324,15 @@ def command(monkeypatch, *flags: str) -> int:
     [
         (("--robot", "cow"), "'cow'"),
         (("--methods", "RS", "XX"), "'XX'"),
-        (("--methods", "HF", "--no-extra"), "no method"),
+        (("--methods", "HF", "--no-include-hf"), "no method"),
         (("--scale", "huge"), "--scale"),
         (("--seeds", "0"), "seeds"),
-        (("--spread-episodes", "0"), "spread_episodes"),
-        (("--test.lanes", "0"), "lanes"),
+        (("--episodes-per-extra-seed", "0"), "episodes_per_extra_seed"),
+        (("--test.num-envs", "0"), "num_envs"),
     ],
 )
 def test_bad_input_ends_in_a_sentence(tmp_path, monkeypatch, capsys, flags, why) -> None:
-    assert command(monkeypatch, "--robot", "point", "--out", str(tmp_path), *flags) == 2
+    assert command(monkeypatch, "--robot", "point", "--run-dir", str(tmp_path), *flags) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and said.count("\n") == 1 and why in said
     assert not list(tmp_path.iterdir())

@@ -18,26 +18,26 @@ from genidm.symmetry import wrap
 from genidm.tasks import (
     Dense,
     GoToGoal,
-    Progress,
+    ProgressReward,
     Sparse,
-    Step,
+    Transition,
     WalkForward,
     ahead,
+    bootstrapped_reward,
     input_size,
     inputs,
-    outlook,
 )
 
 # It arrives, it falls, it diverges beyond that, and it runs into the time limit.
 ROBOT = Point(speed=4.0, falls_at=6.0, diverges_at=6.1)
-REWARDS = {"progress": Progress(), "sparse": Sparse(), "dense": Dense(distance=0.7, cost=0.3)}
-TASK = GoToGoal(episode_steps=35, reach=0.15)
+REWARDS = {"progress": ProgressReward(), "sparse": Sparse(), "dense": Dense(distance=0.7, cost=0.3)}
+TASK = GoToGoal(episode_steps=35, goal_radius=0.15)
 LANES, STEPS = 48, 300
 
 
-def steering(lanes, key: jax.Array) -> jax.Array:
+def steered(lanes, key: jax.Array) -> jax.Array:
     """A third of the lanes go to the goal, a third away from it, a third anywhere."""
-    s, way = lanes.robots.observation, lanes.displacement
+    s, way = lanes.robots.observation, lanes.relative_goal
     straight, away = (Straight(jnp.float32(pace), ROBOT)(s, way) for pace in (1.0, -1.0))
     anywhere = jax.vmap(lambda k: jax.random.uniform(k, (3,), minval=-1.0))(key)
     kind = jnp.arange(LANES)[:, None] % 3
@@ -45,22 +45,22 @@ def steering(lanes, key: jax.Array) -> jax.Array:
 
 
 @functools.cache
-def walked() -> dict[str, Step]:
+def walked() -> dict[str, Transition]:
     """The same steps `[STEPS, LANES]` under each reward, in NumPy."""
     tasks = {name: dataclasses.replace(TASK, reward=r) for name, r in REWARDS.items()}
 
     def step(lanes, _):
         lanes, keys = split(lanes)
-        made = {name: advance(t, ROBOT, lanes, steering(lanes, keys)) for name, t in tasks.items()}
+        made = {name: advance(t, ROBOT, lanes, steered(lanes, keys)) for name, t in tasks.items()}
         return made["progress"][0], {name: step for name, (_, step) in made.items()}
 
-    def walk(keys: jax.Array) -> dict[str, Step]:
+    def walk(keys: jax.Array) -> dict[str, Transition]:
         return jax.lax.scan(step, TASK.start(ROBOT, keys), length=STEPS)[1]
 
     return jax.tree.map(np.asarray, jax.jit(walk)(jax.random.split(jax.random.key(0), LANES)))
 
 
-def distances(step: Step) -> tuple[np.ndarray, np.ndarray]:
+def distances(step: Transition) -> tuple[np.ndarray, np.ndarray]:
     """Metres to the goal before and after each step, horizontally."""
     ways = (np.float64(step.goal) - x.position for x in (step.before, step.after))
     before, after = (np.hypot(way[..., 0], way[..., 1]) for way in ways)
@@ -72,7 +72,7 @@ def distances(step: Step) -> tuple[np.ndarray, np.ndarray]:
 
 def test_every_episode_has_a_start_a_heading_and_a_goal_of_its_own() -> None:
     step = walked()["progress"]
-    first = step.age == 0
+    first = step.episode_step == 0
     episodes = first.sum()
     assert episodes > 500 and first[0].all()
     np.testing.assert_array_equal(first[1:], step.last[:-1])
@@ -80,12 +80,14 @@ def test_every_episode_has_a_start_a_heading_and_a_goal_of_its_own() -> None:
         assert len(np.unique(x[first], axis=0)) == episodes
     goes_on = ~first[1:]
     np.testing.assert_array_equal(step.goal[1:][goes_on], step.goal[:-1][goes_on])
-    np.testing.assert_array_equal(step.age[1:][goes_on], step.age[:-1][goes_on] + 1)
+    np.testing.assert_array_equal(
+        step.episode_step[1:][goes_on], step.episode_step[:-1][goes_on] + 1
+    )
 
 
-def goals(step: Step) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def goals(step: Transition) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Heading, distance and bearing of the goal at the start of every episode."""
-    first = step.age == 0
+    first = step.episode_step == 0
     way = (step.goal - step.before.position)[first]
     heading = step.before.heading[first]
     bearing = wrap(jnp.asarray(np.arctan2(way[:, 1], way[:, 0]) - heading))
@@ -100,7 +102,7 @@ def test_goals_lie_where_the_test_has_them() -> None:
         assert low - 1e-5 < x.min() and x.max() < high + 1e-5
         counts = np.histogram(x, 8, (low, high))[0]
         assert abs(counts - len(x) / 8).max() < 4 * np.sqrt(len(x) / 8)
-    start = step.before.position[step.age == 0]
+    start = step.before.position[step.episode_step == 0]
     drawn = np.corrcoef([heading, distance, bearing, start[:, 0], start[:, 1]])
     assert abs(drawn - np.eye(5)).max() < 4 / np.sqrt(len(heading))
     assert (step.goal[..., 2] == ROBOT.standing_height).all()
@@ -109,7 +111,7 @@ def test_goals_lie_where_the_test_has_them() -> None:
 def test_what_is_done_has_nothing_to_do_with_what_was_drawn() -> None:
     """No key is used for both: a lane that goes anywhere goes there whatever its start."""
     step = walked()["progress"]
-    anywhere = (step.age == 0) & (np.arange(LANES) % 3 == 2)
+    anywhere = (step.episode_step == 0) & (np.arange(LANES) % 3 == 2)
     start, a = step.before.position[anywhere], step.action[anywhere]
     drawn = np.corrcoef(np.concatenate([start - step.goal[anywhere], start, a], axis=-1).T)
     assert abs(drawn[-3:, :-3]).max() < 4 / np.sqrt(len(start))
@@ -120,7 +122,7 @@ def test_headings_and_bearings_can_be_set(yaw: float, bearing: float) -> None:
     start = functools.partial(GoToGoal(start_yaw=yaw, bearing=bearing).start, ROBOT)
     lanes = jax.jit(start)(jax.random.split(jax.random.key(1), 500))
     heading = np.asarray(lanes.robots.heading)
-    angle = jnp.arctan2(lanes.displacement[:, 1], lanes.displacement[:, 0])
+    angle = jnp.arctan2(lanes.relative_goal[:, 1], lanes.relative_goal[:, 0])
     seen = np.asarray(wrap(angle - lanes.robots.heading))
     assert yaw + 0.3 < abs(heading).max() < yaw + 0.5 + 1e-5  # half a radian is the point's own
     assert 0.95 * bearing <= abs(seen).max() < bearing + 1e-5
@@ -150,9 +152,9 @@ def test_walking_forward_is_worth_what_the_paper_says() -> None:
     step_all = jax.jit(robot.step)
     for _ in range(2):
         after = step_all(lanes.robots, a)
-        step = task.judge(robot, lanes, a, after)
+        step = task.transition(robot, lanes, a, after)
         before, lanes = lanes.robots, lanes.replace(robots=after)
-    ahead = (after.position[:, 0] - before.position[:, 0]) / robot.control_step
+    ahead = (after.position[:, 0] - before.position[:, 0]) / robot.dt
     down = np.asarray(after.fallen | after.diverged)
     assert 20 < down.sum() < 380 and np.asarray(after.diverged).any()
     np.testing.assert_array_equal(step.terminal, down)
@@ -164,15 +166,15 @@ def test_walking_forward_is_worth_what_the_paper_says() -> None:
 # ── where they end ──────────────────────────────────────────────────────────────────────
 
 
-def endings(step: Step) -> tuple[np.ndarray, np.ndarray]:
+def endings(step: Transition) -> tuple[np.ndarray, np.ndarray]:
     """Where the robot arrived, and where it fell or its physics diverged."""
-    return distances(step)[1] <= TASK.reach, step.after.fallen | step.after.diverged
+    return distances(step)[1] <= TASK.goal_radius, step.after.fallen | step.after.diverged
 
 
 def test_arriving_and_falling_are_ends_and_the_time_limit_is_none() -> None:
     step = walked()["progress"]
     reached, down = endings(step)
-    late = step.age + 1 == TASK.episode_steps
+    late = step.episode_step + 1 == TASK.episode_steps
     np.testing.assert_array_equal(step.terminal, reached | down)
     np.testing.assert_array_equal(step.last, reached | down | late)
     ended = [x.sum() for x in (reached, step.after.fallen, step.after.diverged, step.last)]
@@ -226,17 +228,17 @@ def test_a_step_is_worth_what_the_paper_says(name: str) -> None:
     for at in np.ndindex(STEPS, LANES):
         expected[:, *at] = ORACLES[name](*(x[at] for x in (before, after, cost, down, reached)))
     np.testing.assert_allclose(step.reward, expected[0], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(step.rest, expected[1], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(step.absorbing_reward, expected[1], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", REWARDS)
 def test_the_outlook_of_an_end_is_the_sum_of_what_would_follow(name: str) -> None:
-    step, discount = walked()[name], 0.97
+    step, discounting = walked()[name], 0.97
     series = np.zeros(step.reward.shape)
     for k in range(1, 1500):
-        series += discount**k * np.float64(step.rest)
+        series += discounting**k * np.float64(step.absorbing_reward)
     expected = step.reward + np.where(step.terminal, series, 0.0)
-    found = np.asarray(outlook(step, discount))
+    found = np.asarray(bootstrapped_reward(step, discounting))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(found[~step.terminal], step.reward[~step.terminal])
 
@@ -245,7 +247,7 @@ def test_no_fall_is_a_way_out() -> None:
     """Who falls is charged as if it never arrived; who arrives has the best there is."""
     reached, down = endings(walked()["sparse"])
     reached, down = reached & ~down, down & ~reached
-    ends = {name: np.asarray(outlook(step, 0.97)) for name, step in walked().items()}
+    ends = {name: np.asarray(bootstrapped_reward(step, 0.97)) for name, step in walked().items()}
     np.testing.assert_allclose(ends["sparse"][down], -1 / 0.03, rtol=1e-5)
     assert (ends["sparse"][reached] == 0).all()
     assert ends["dense"][down].max() < -50 < -1 < ends["dense"][reached].min()
@@ -264,13 +266,13 @@ def test_a_policy_is_fed_the_way_to_the_goal_where_there_is_one() -> None:
     np.testing.assert_array_equal(fed[..., size:], step.goal - step.after.position)
     task, keys = WalkForward(), jax.random.split(jax.random.key(0), 3)
     lanes = jax.eval_shape(functools.partial(task.start, ROBOT), keys)
-    assert lanes.goal is None and lanes.displacement is None
+    assert lanes.goal is None and lanes.relative_goal is None
     assert inputs(lanes.robots.observation, None).shape == (3, input_size(ROBOT, task))
 
 
 def test_a_goal_that_cannot_be_reached_is_refused() -> None:
-    with pytest.raises(BadInput, match="reach"):
-        GoToGoal(reach=0.0)
+    with pytest.raises(BadInput, match="goal_radius"):
+        GoToGoal(goal_radius=0.0)
 
 
 @pytest.mark.parametrize("task", [WalkForward, GoToGoal])

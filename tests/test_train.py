@@ -51,10 +51,10 @@ def test_a_robot_without_a_file_of_its_own_is_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ROBOTS, "point", Point)
-    small = ("--test.max-steps", "40", "--test.lanes", "16", "--test.chunk", "10")
+    small = ("--test.max-steps", "40", "--test.num-envs", "16", "--test.chunk", "10")
     run("--robot", "point", "--method", "RS", "--scale", "0.5", "--episodes", "2", *small,
-        "--method.fit.updates", "20", "--method.look-ahead", "5", "--method.agent.lanes", "16",
-        "--out", str(tmp_path))  # fmt: skip
+        "--method.fit.updates", "20", "--method.goal-horizon", "5", "--method.agent.num-envs", "16",
+        "--run-dir", str(tmp_path))  # fmt: skip
     assert capsys.readouterr().out.count("\nRS ") == 1
     stages = {
         path.parent.name.rsplit("-", 1)[0] for path in (tmp_path / "point").glob("*/done.json")

@@ -1,4 +1,4 @@
-"""Journeys through waypoints, on a point whose every journey has a closed form."""
+"""Runs through waypoints, on a point whose every journey has a closed form."""
 
 from __future__ import annotations
 
@@ -13,44 +13,51 @@ from point import Point, Straight
 
 from genidm import devices
 from genidm.errors import BadInput
-from genidm.evaluation.waypoints import Follow, Journeys, follow, straight
-from genidm.report.journeys import journeys
+from genidm.evaluation.waypoints import (
+    WaypointRuns,
+    WaypointSettings,
+    first_unreached,
+    follow_waypoints,
+)
+from genidm.report.waypoint_figure import draw_waypoint_runs
 
 WAYPOINTS = np.array([[2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-SETTINGS = Follow(max_steps=300, reach=0.2, chunk=40)
+SETTINGS = WaypointSettings(max_steps=300, goal_radius=0.2, chunk=40)
 COUNT = 5
 
 
-def journey(robot: Point, pace: float = 1.0, **changes) -> Journeys:
+def journey(robot: Point, pace: float = 1.0, **changes) -> WaypointRuns:
     keys, yaw = jax.random.split(jax.random.key(0), COUNT), jnp.linspace(-1, 1, COUNT)
     given = dict(waypoints=WAYPOINTS, settings=SETTINGS) | changes
-    return follow(
+    return follow_waypoints(
         robot, Straight(jnp.float32(pace), robot), keys=keys, yaw=yaw, quiet=True, **given
     )
 
 
 @pytest.fixture(scope="module")
-def made() -> Journeys:
+def made() -> WaypointRuns:
     return journey(Point())
 
 
-def one_way(start: np.ndarray, step: float, reach: float) -> tuple[list[np.ndarray], list[int]]:
+def one_way(
+    start: np.ndarray, step: float, goal_radius: float
+) -> tuple[list[np.ndarray], list[int]]:
     """Positions after each step straight at the waypoint whose turn it is, and arrivals."""
     o, way, arrivals = start.copy(), [start.copy()], []
     for t in range(1, SETTINGS.max_steps + 1):
         to = WAYPOINTS[len(arrivals)] - o
         o = o + step * to / np.linalg.norm(to)
         way.append(o.copy())
-        if np.linalg.norm(WAYPOINTS[len(arrivals)] - o) <= reach:
+        if np.linalg.norm(WAYPOINTS[len(arrivals)] - o) <= goal_radius:
             arrivals.append(t)
         if len(arrivals) == len(WAYPOINTS):
             break
     return way, arrivals
 
 
-def test_every_journey_is_the_closed_form(made: Journeys) -> None:
+def test_every_journey_is_the_closed_form(made: WaypointRuns) -> None:
     for i in range(COUNT):
-        way, arrivals = one_way(np.float64(made.position[i, 0, :2]), 0.05, SETTINGS.reach)
+        way, arrivals = one_way(np.float64(made.position[i, 0, :2]), 0.05, SETTINGS.goal_radius)
         assert made.arrival[i].tolist() == arrivals and made.steps[i] == arrivals[-1]
         np.testing.assert_allclose(made.position[i, : len(way), :2], way, atol=1e-4)
         after = made.position[i, len(way) :]
@@ -61,28 +68,28 @@ def test_every_journey_is_the_closed_form(made: Journeys) -> None:
     np.testing.assert_allclose(made.times, 0.05 * made.arrival)
 
 
-def test_deviation_is_the_distance_from_the_leg(made: Journeys) -> None:
+def test_cross_track_error_is_the_distance_from_the_leg(made: WaypointRuns) -> None:
     for i in range(COUNT):
         corners = np.concatenate([made.position[i, :1, :2], WAYPOINTS])
         for t in range(made.steps[i] + 1):
             leg = int(np.sum(made.arrival[i] < t))
             dense = np.linspace(corners[leg], corners[leg + 1], 20001)
             apart = np.linalg.norm(dense - made.position[i, t, :2], axis=1).min()
-            assert made.deviation[i, t] == pytest.approx(apart, abs=2e-3)
-        assert np.isnan(made.deviation[i, made.steps[i] + 1 :]).all()
+            assert made.cross_track_error[i, t] == pytest.approx(apart, abs=2e-3)
+        assert np.isnan(made.cross_track_error[i, made.steps[i] + 1 :]).all()
     # A robot that turns at 0.2 m before a corner has left the leg there, and never further.
-    assert 0.1 < np.nanmax(made.deviation) <= SETTINGS.reach + 1e-6
+    assert 0.1 < np.nanmax(made.cross_track_error) <= SETTINGS.goal_radius + 1e-6
 
 
-def test_askew_is_between_heading_and_course(made: Journeys) -> None:
+def test_heading_error_is_between_heading_and_course(made: WaypointRuns) -> None:
     i, t = 2, 30
     step = made.position[i, t + 1] - made.position[i, t]
     expected = abs(math.remainder(made.heading[i, t] - math.atan2(step[1], step[0]), 2 * math.pi))
-    assert made.askew[i, t] == pytest.approx(expected, abs=1e-5)
-    assert np.isnan(made.askew[i, made.steps[i] :]).all()
+    assert made.heading_error[i, t] == pytest.approx(expected, abs=1e-5)
+    assert np.isnan(made.heading_error[i, made.steps[i] :]).all()
 
 
-def test_the_number_of_devices_changes_nothing(made: Journeys) -> None:
+def test_the_number_of_devices_changes_nothing(made: WaypointRuns) -> None:
     alone = journey(Point(), mesh=devices.mesh(jax.devices()[:1]))
     np.testing.assert_array_equal(alone.arrival, made.arrival)
     np.testing.assert_allclose(alone.position, made.position, atol=1e-5)
@@ -95,19 +102,19 @@ def test_who_falls_or_is_late_has_reached_what_it_has_reached() -> None:
         and (fallen.arrival[:, 0] > 0).all()
         and (fallen.arrival[:, 1] == -1).all()
     )
-    late = journey(Point(), settings=Follow(max_steps=60, reach=0.2, chunk=40))
+    late = journey(Point(), settings=WaypointSettings(max_steps=60, goal_radius=0.2, chunk=40))
     assert (late.steps == 60).all() and not late.fell.any() and late.position.shape[1] == 61
     assert np.isnan(late.times[:, 1:]).all()
     found = late.summary()
     assert found["reached"] == [1.0, 0.0, 0.0] and found["seconds"][1] is None
-    assert found["deviation"] < 0.2 and found["journeys"] == COUNT
+    assert found["cross_track_error"] < 0.2 and found["runs"] == COUNT
 
 
 def test_any_planner_will_do() -> None:
     """One that goes round the outside of each corner."""
 
     def outside(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
-        return straight(o, waypoints, left) + jnp.asarray([0.1, 0.0, 0.0])
+        return first_unreached(o, waypoints, left) + jnp.asarray([0.1, 0.0, 0.0])
 
     there = journey(Point(), planner=outside)
     assert (there.arrival > 0).all() and there.position[..., 0].max() > 2.0
@@ -116,7 +123,10 @@ def test_any_planner_will_do() -> None:
 @pytest.mark.parametrize(
     ("planner", "answer"),
     [
-        (lambda o, waypoints, left: straight(o, waypoints, left)[:, :2], r"float32\[\d, 2\]"),
+        (
+            lambda o, waypoints, left: first_unreached(o, waypoints, left)[:, :2],
+            r"float32\[\d, 2\]",
+        ),
         (lambda o, waypoints, left: o[:, :1], r"float32\[\d, 1\]"),
         (lambda o, waypoints, left: o[0], r"float32\[3\]"),
         (lambda o, waypoints, left: o.sum(), r"float32\[\]"),
@@ -164,7 +174,7 @@ def test_a_planner_may_answer_with_numpys_constant() -> None:
 def test_a_controller_that_answers_something_else_is_refused(controller) -> None:
     keys = jax.random.split(jax.random.key(0), 2)
     with pytest.raises(BadInput, match=r"the controller must answer .* of shape \(1, 3\)"):
-        follow(Point(), controller, WAYPOINTS, keys, np.zeros(2), quiet=True)
+        follow_waypoints(Point(), controller, WAYPOINTS, keys, np.zeros(2), quiet=True)
 
 
 def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
@@ -175,20 +185,20 @@ def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
             journey(Point(), waypoints=wrong)
     with pytest.raises(BadInput, match="each of as many"):
         journey(Point(), waypoints=[[1.0, 2.0], [3.0]])
-    with pytest.raises(BadInput, match=r"reach must lie in \(0, ∞\)"):
-        Follow(reach=0.0)
+    with pytest.raises(BadInput, match=r"goal_radius must lie in \(0, ∞\)"):
+        WaypointSettings(goal_radius=0.0)
 
 
 def test_a_robot_has_a_key_and_a_yaw() -> None:
     keys = jax.random.split(jax.random.key(0), 2)
     for yaw in (np.zeros(3), 0.0):
         with pytest.raises(BadInput, match=r"keys \[B\] and yaw \[B\]"):
-            follow(Point(), lambda s, way: way, WAYPOINTS, keys, yaw)
+            follow_waypoints(Point(), lambda s, way: way, WAYPOINTS, keys, yaw)
     with pytest.raises(BadInput, match="no robots to lead"):
-        follow(Point(), lambda s, way: way, WAYPOINTS, keys[:0], np.zeros(0))
+        follow_waypoints(Point(), lambda s, way: way, WAYPOINTS, keys[:0], np.zeros(0))
 
 
-def test_each_robot_may_have_waypoints_of_its_own(made: Journeys) -> None:
+def test_each_robot_may_have_waypoints_of_its_own(made: WaypointRuns) -> None:
     shift = np.linspace(0.0, 1.0, COUNT)[:, None, None] * [1.0, -1.0]
     own = journey(Point(), waypoints=WAYPOINTS + shift)
     np.testing.assert_allclose(own.waypoints[..., :2], WAYPOINTS + shift, atol=1e-6)
@@ -197,22 +207,24 @@ def test_each_robot_may_have_waypoints_of_its_own(made: Journeys) -> None:
         assert own.steps[i] == own.arrival[i, -1]
         reached = own.position[i, own.arrival[i], :2]
         apart = np.linalg.norm(reached - own.waypoints[i, :, :2], axis=-1)
-        assert (apart <= SETTINGS.reach + 1e-6).all() and (apart > SETTINGS.reach - 0.06).all()
+        assert (apart <= SETTINGS.goal_radius + 1e-6).all() and (
+            apart > SETTINGS.goal_radius - 0.06
+        ).all()
     with pytest.raises(BadInput, match="for each of the 5"):
         journey(Point(), waypoints=np.zeros((COUNT - 1, 3, 2)))
 
 
-def test_what_is_watched_is_kept_of_every_state(made: Journeys) -> None:
+def test_what_is_recorded_is_kept_of_every_state(made: WaypointRuns) -> None:
     kept = journey(
-        Point(), watch=lambda state: {"s": state.observation, "x": state.physics}
-    ).watched
-    assert kept["s"].shape[:2] == made.heading.shape and made.watched == ()
+        Point(), record=lambda state: {"s": state.observation, "x": state.physics}
+    ).recorded
+    assert kept["s"].shape[:2] == made.heading.shape and made.recorded == ()
     np.testing.assert_array_equal(kept["x"].position, made.position)
     np.testing.assert_array_equal(kept["s"][..., 0], made.position[..., 2])
 
 
-def test_the_figure_shows_every_method(made: Journeys, tmp_path: Path) -> None:
-    fig = journeys({"LR": made, "VGCP": made}, SETTINGS.reach, tmp_path / "w.png")
+def test_the_figure_shows_every_method(made: WaypointRuns, tmp_path: Path) -> None:
+    fig = draw_waypoint_runs({"LR": made, "VGCP": made}, SETTINGS.goal_radius, tmp_path / "w.png")
     assert (tmp_path / "w.png").stat().st_size > 10_000
     above = fig.axes[0]
     assert above.get_title() == "LR"

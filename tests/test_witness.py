@@ -120,7 +120,9 @@ def test_it_learns_and_is_tested(tmp_path: Path, monkeypatch) -> None:
     """Random actions are those of the seed; what learns is another controller after each part."""
     env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
     env_checker.check_env(witness.GoalAnt(TASK, 20))
-    early = dataclasses.replace(HER_SP, agent=dataclasses.replace(HER_SP.agent, warmup=100))
+    early = dataclasses.replace(
+        HER_SP, agent=dataclasses.replace(HER_SP.agent, min_replay_size=100)
+    )
     monkeypatch.setattr(witness, "HER_SP", early)
     witness.main(tmp_path / "w.json", interactions=1000, episodes=2, parts=2)
     result = json.loads((tmp_path / "w.json").read_text())

@@ -24,12 +24,12 @@ from genidm.agents.sac import SAC
 from genidm.controller import PRETRAINED, load
 from genidm.evaluation.evaluate import evaluate, flatten, run
 from genidm.evaluation.scenarios import scenarios
-from genidm.evaluation.waypoints import Follow, follow
+from genidm.evaluation.waypoints import WaypointSettings, follow_waypoints
 from genidm.paper.fit import fit
 from genidm.paper.generalize import Generalize, generalize
 from genidm.paper.methods import LR
 from genidm.robots import Ant, Humanoid, Robot
-from genidm.runs.run import way_and_physics
+from genidm.runs.run import position_and_physics
 from genidm.tasks import GoToGoal, WalkForward
 
 SINGLE = np.dtype(np.float32)
@@ -42,18 +42,30 @@ LEARNERS: list[tuple[Any, Any]] = [
 
 def steered(robot: Robot, controller: Any) -> dict[str, Any]:
     """The test, its traces and waypoints."""
-    bank = scenarios(robot, 1, 5)
+    tested_scenarios = scenarios(robot, 1, 5)
     outcome, traces = run(
-        robot, controller, flatten(bank), TEST, traced=2, watch=way_and_physics, quiet=True
+        robot,
+        controller,
+        flatten(tested_scenarios),
+        TEST,
+        traced=2,
+        record=position_and_physics,
+        quiet=True,
     )
     keys = jax.random.split(jax.random.key(0), 3)
     way = [[0.5, 0.0], [0.5, 0.5]]
-    made = follow(
-        robot, controller, way, keys, np.zeros(3), settings=Follow(40, chunk=10), quiet=True
+    made = follow_waypoints(
+        robot,
+        controller,
+        way,
+        keys,
+        np.zeros(3),
+        settings=WaypointSettings(40, chunk=10),
+        quiet=True,
     )
     assert {x.dtype for x in jax.tree.leaves(outcome) if x.dtype.kind == "f"} == {SINGLE}
     return {
-        "bank": bank.digest(),
+        "scenarios": tested_scenarios.digest(),
         "closest": np.asarray(outcome.closest).tolist(),
         "steps": np.asarray(outcome.steps).tolist(),
         "way": np.asarray(traces[1].way[-1]).tolist(),
@@ -72,7 +84,7 @@ def fitted(robot: Robot, directory: Path) -> dict[str, Any]:
         robot, AGENTS[RandomActions], 512, task=WalkForward(episode_steps=20), quiet=True
     )
     samples, residual = generalize(
-        robot, record, jax.random.key(0), Generalize(segment=6, lanes=32), look_ahead=5
+        robot, record, jax.random.key(0), Generalize(segment=6, num_envs=32), goal_horizon=5
     )
     assert {x.dtype for x in jax.tree.leaves((record.s, samples))} == {SINGLE}
     model = fit(robot, samples, jax.random.key(1), tiny(LR).fit, quiet=True)
@@ -102,7 +114,7 @@ def compare(there: dict[str, Any], here: dict[str, Any]) -> None:
     for name, x in here.items():
         if isinstance(x, dict):
             compare(there[name], x)
-        elif name in ("bank", "banks", "steps", "arrival"):
+        elif name in ("scenarios", "banks", "steps", "arrival"):
             assert there[name] == x, name
         else:
             np.testing.assert_allclose(there[name], x, atol=2e-4, err_msg=name)

@@ -10,24 +10,36 @@ from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.paper.generalize import Generalize
-from genidm.paper.methods import Direct, Inverse
+from genidm.paper.methods import GoalConditioned, InverseDynamics
 
-M = TypeVar("M", Direct, Inverse)
+M = TypeVar("M", GoalConditioned, InverseDynamics)
 
-_SIZE = dict(lanes=16, unroll=8)
+_SIZE = dict(num_envs=16, unroll_length=8)
 _REPLAYING = dict(
-    **_SIZE, updates=2, batch=16, capacity=512, warmup=128, hidden=(8,), critic_hidden=(8,)
+    **_SIZE,
+    grad_updates_per_step=2,
+    batch_size=16,
+    max_replay_size=512,
+    min_replay_size=128,
+    policy_hidden_layer_sizes=(8,),
+    critic_hidden_layer_sizes=(8,),
 )
 AGENTS = {
-    PPO: PPO(**_SIZE, epochs=1, minibatches=2, hidden=(8,), value_hidden=(8,)),
+    PPO: PPO(
+        **_SIZE,
+        num_updates_per_batch=1,
+        num_minibatches=2,
+        policy_hidden_layer_sizes=(8,),
+        value_hidden_layer_sizes=(8,),
+    ),
     SAC: SAC(**_REPLAYING, her=HER()),
     DDPG: DDPG(**_REPLAYING, her=HER()),
     RandomActions: RandomActions(**_SIZE),
 }
 
-TEST = Test(max_steps=40, lanes=16, chunk=10)
+TEST = EvaluationSettings(max_steps=40, num_envs=16, chunk=10)
 
 
 def tiny(method: M, **changes) -> M:
@@ -35,10 +47,10 @@ def tiny(method: M, **changes) -> M:
     fields = dict(
         agent=AGENTS[type(method.agent)], task=dataclasses.replace(method.task, episode_steps=20)
     )
-    if isinstance(method, Inverse):
+    if isinstance(method, InverseDynamics):
         fields |= dict(
-            fit=dataclasses.replace(method.fit, updates=200, batch=16, idm=(8,), lfm=(8,)),
-            generalize=method.generalize and Generalize(segment=6, lanes=32),
-            look_ahead=5,
+            fit=dataclasses.replace(method.fit, updates=200, batch_size=16, idm=(8,), lfm=(8,)),
+            generalize=method.generalize and Generalize(segment=6, num_envs=32),
+            goal_horizon=5,
         )
     return dataclasses.replace(method, **(fields | changes))

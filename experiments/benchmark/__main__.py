@@ -16,7 +16,7 @@ from genidm import files
 from genidm.errors import BadInput
 from genidm.robots import Robot, by_name
 from genidm.robots.mujoco import MujocoRobot
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 
 def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
@@ -29,7 +29,7 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
     if robot.name not in ROWS and not isinstance(robot, MujocoRobot):
         raise BadInput(f"there are rows for robots with a MuJoCo model, not for the {robot.name}")
     rows, out = choose(options.rows, ROWS.get(robot.name, OTHERS)), place(robot, options)
-    for lanes in (options.lanes, options.wide):
+    for lanes in (options.num_envs, options.wide):
         if lanes % robot.mesh().size:
             raise BadInput(f"{lanes} lanes cannot be shared among {robot.mesh().size} devices")
     with files.disk(out):  # before the measuring, not after it
@@ -58,7 +58,7 @@ def main() -> None:
     ) -> None:
         print(table(benchmark(by_name(options.robot, options.engine), options)))
 
-    guarded(command, "How fast everything is, as ratios to what limits it.")
+    run_cli(command, "How fast everything is, as ratios to what limits it.")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.robots import Robot
 
 T = TypeVar("T")
@@ -36,9 +36,9 @@ class Options:
       rows: only the rows of these names, or of which these are a part, and those that they
         are compared with; the file then holds no others.
       seconds: of measuring, for each row.
-      lanes: robots at once in the rows of collecting.
+      num_envs: robots at once in the rows of collecting.
       wide: robots at once in the rows of 𝒢 and evaluation.
-      bank: test seeds, and episodes for each of them, of the useful share of evaluation.
+      scenarios: test seeds, and episodes for each of them, of the useful share of evaluation.
     """
 
     robot: str = "ant"
@@ -47,15 +47,15 @@ class Options:
     run: Path | str | None = None
     rows: tuple[str, ...] = ()
     seconds: float = 60.0
-    lanes: int = PPO().lanes
-    wide: int = Test().lanes
-    bank: tuple[int, int] = (10, 1000)
+    num_envs: int = PPO().num_envs
+    wide: int = EvaluationSettings().num_envs
+    scenarios: tuple[int, int] = (10, 1000)
 
     def __post_init__(self) -> None:
         if not 0 < self.seconds < math.inf:
             raise BadInput(f"seconds must be a number above 0, not {self.seconds}")
-        if min(self.lanes, self.wide, *self.bank) < 1:
-            raise BadInput("lanes, wide and both numbers of the bank must be at least 1")
+        if min(self.num_envs, self.wide, *self.scenarios) < 1:
+            raise BadInput("num_envs, wide and both numbers of scenarios must be at least 1")
 
 
 @dataclasses.dataclass
@@ -79,9 +79,9 @@ class Bench:
             self._made[make] = make(self)
         return self._made[make]
 
-    def lanes(self, wide: bool) -> int:
+    def num_envs(self, wide: bool) -> int:
         """Robots at once: as in 𝒢 and evaluation, or as in collecting."""
-        return self.options.wide if wide else self.options.lanes
+        return self.options.wide if wide else self.options.num_envs
 
     @functools.cached_property
     def mesh(self) -> Mesh:

@@ -14,15 +14,15 @@ import numpy as np
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, carried, timed
 from genidm import devices
-from genidm.agents import walking as steps
-from genidm.agents.alternating import Alternating, Learner
+from genidm.agents import unroll as steps
 from genidm.agents.base import Agent, Iterate, Learning
 from genidm.agents.collect import CHUNK, collect
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.off_policy import OffPolicy
+from genidm.agents.rollout_then_learn import AgentState, RolloutThenLearn
 from genidm.experience import Experience, concatenate
 from genidm.paper.methods import LR, RL, RS, Method
-from genidm.tasks import Step
+from genidm.tasks import Transition
 
 
 def segment(bench: Bench) -> int:
@@ -60,7 +60,7 @@ def unrecorded(bench: Bench) -> Probe:
     learning, learner = _started(bench, RL, agent)
     whole = steps.record
 
-    def least(step: Step) -> Experience:
+    def least(step: Transition) -> Experience:
         return whole(step).replace(o_next=None, first=None, last=None, valid=None, physics=None)
 
     with mock.patch.object(steps, "record", least):
@@ -71,20 +71,20 @@ def unrecorded(bench: Bench) -> Probe:
 def walking(bench: Bench, *, method: Method) -> Probe:
     """A learner's stepping alone: the policy is asked, all is recorded, nothing is learned."""
     agent, programs, learner = _programs(bench, method)
-    policy = programs.acting(learner.training)
-    return _steps(agent, lambda lanes: programs.stepping(*policy, lanes)[0], learner.lanes)
+    policy = programs.acting(learner.training_state)
+    return _steps(agent, lambda lanes: programs.stepping(*policy, lanes)[0], learner.env_state)
 
 
 def updating(bench: Bench, *, method: Method) -> Probe:
     """An off-policy learner's other half alone: the same steps taken in again and again."""
     agent, programs, learner = _programs(bench, method)
-    batch = programs.stepping(*programs.acting(learner.training), learner.lanes)[2]
+    batch = programs.stepping(*programs.acting(learner.training_state), learner.env_state)[2]
     batch = devices.gather(batch, bench.mesh)
 
     def update(training: Any) -> Any:
         return programs.updating(training, batch)[0]
 
-    return _steps(agent, update, learner.training)
+    return _steps(agent, update, learner.training_state)
 
 
 def writing(bench: Bench) -> Probe:
@@ -98,11 +98,11 @@ def writing(bench: Bench) -> Probe:
 def _agent(bench: Bench, method: Method) -> Any:
     """The method's agent, which learns from its first iteration on."""
     agent: Any = method.agent
-    agent = dataclasses.replace(agent, lanes=bench.options.lanes)
-    return dataclasses.replace(agent, warmup=0) if isinstance(agent, OffPolicy) else agent
+    agent = dataclasses.replace(agent, num_envs=bench.options.num_envs)
+    return dataclasses.replace(agent, min_replay_size=0) if isinstance(agent, OffPolicy) else agent
 
 
-def _programs(bench: Bench, method: Method) -> tuple[Any, Alternating, Learner]:
+def _programs(bench: Bench, method: Method) -> tuple[Any, RolloutThenLearn, AgentState]:
     """The method's agent, its two programs, and its learner at the start."""
     agent = _agent(bench, method)
     programs = agent.programs(bench.robot, method.task, bench.mesh)
@@ -115,7 +115,7 @@ def _started(bench: Bench, method: Method, agent: Agent) -> tuple[Learning, Any]
     return learning, _placed(learning)
 
 
-def _placed(learning: Learning | Alternating) -> Any:
+def _placed(learning: Learning | RolloutThenLearn) -> Any:
     """A learner at its start, on its devices."""
     return learning.place(jax.jit(learning.start)(jax.random.key(0)))
 
@@ -137,4 +137,4 @@ def _iterating(
 def _steps(agent: Agent, iteration: Callable[[Any], Any], start: Any) -> Probe:
     """Steps/s over all lanes of what does an iteration's steps in a call."""
     call = carried(iteration, start)
-    return Probe(timed(call, agent.lanes * agent.unroll), counted(agent.lanes, "lane"))
+    return Probe(timed(call, agent.num_envs * agent.unroll_length), counted(agent.num_envs, "lane"))

@@ -17,11 +17,11 @@ from experiments.benchmark.stepping import STEPS, among, place, step_batch, walk
 from genidm import devices
 from genidm.controller import load
 from genidm.engines.mujoco import MuJoCo
-from genidm.evaluation.evaluate import Steering, Test, evaluate, flatten
-from genidm.evaluation.evaluator import Evaluator, Queue
+from genidm.evaluation.evaluate import ControllerFn, EvaluationSettings, evaluate, flatten
+from genidm.evaluation.evaluator import EvaluationState, Evaluator
 from genidm.evaluation.scenarios import Scenarios, scenarios
 from genidm.paper.fit import fit
-from genidm.paper.generalize import rotate
+from genidm.paper.generalize import rotate_exactly
 from genidm.paper.methods import LR
 from genidm.paper.pairs import pairs
 from genidm.progress import METRICS, read_metrics
@@ -34,25 +34,25 @@ from genidm.store import Stage
 WARM_UP = 100
 
 
-def controller(bench: Bench) -> Steering:
+def controller(bench: Bench) -> ControllerFn:
     """That of the run, or an untrained one."""
     if bench.options.run:
         return load(bench.options.run, bench.robot)
-    turned = rotate(bench.robot, bench.once(record), jax.random.key(1))
+    turned = rotate_exactly(bench.robot, bench.once(record), jax.random.key(1))
     # To the next step, as the episodes of a short record may all end before more.
-    samples = pairs(bench.robot, bench.once(record), turned, look_ahead=1)
+    samples = pairs(bench.robot, bench.once(record), turned, goal_horizon=1)
     settings = dataclasses.replace(LR.fit, updates=1)
     return fit(bench.robot, samples, jax.random.key(2), settings, quiet=True)
 
 
 def evaluating(bench: Bench) -> Probe:
-    """What `evaluate` does with a bank; lane-steps without an episode count too."""
-    settings, bank = _test(bench)
-    evaluator = Evaluator(bench.robot, flatten(bank), settings, bench.mesh)
+    """What `evaluate` does with scenarios; lane-steps without an episode count too."""
+    settings, test_scenarios = _test(bench)
+    evaluator = Evaluator(bench.robot, flatten(test_scenarios), settings, bench.mesh)
     queue = evaluator.start()
     program = evaluator.prepare(bench.once(controller), queue)
 
-    def step(queue: Queue) -> Queue:
+    def step(queue: EvaluationState) -> EvaluationState:
         queue = program(queue)
         return evaluator.start() if evaluator.ended(queue) == evaluator.total else queue
 
@@ -110,26 +110,28 @@ def retracing(bench: Bench) -> Probe:
 
 
 def lane_steps(bench: Bench) -> tuple[float, float]:
-    """Lane-steps of evaluating the bank: all of them, and those spent in episodes."""
+    """Lane-steps of evaluating the scenarios: all of them, and those spent in episodes."""
     stage = Stage(bench.scratch / "test")
-    settings, bank = _test(bench)
+    settings, test_scenarios = _test(bench)
     model = bench.once(controller)
-    outcome = evaluate(bench.robot, model, bank, settings, mesh=bench.mesh, stage=stage)
+    outcome = evaluate(bench.robot, model, test_scenarios, settings, mesh=bench.mesh, stage=stage)
     useful = float(outcome.steps.sum())
     return useful / read_metrics(stage.path(METRICS))[-1]["useful"], useful
 
 
 def tested(bench: Bench, *, useful: bool) -> Probe:
-    """Lane-steps of evaluating the whole bank: those spent in episodes, or all."""
-    seeds, episodes = bench.options.bank
+    """Lane-steps of evaluating all scenarios: those spent in episodes, or all."""
+    seeds, episodes = bench.options.scenarios
     steps = bench.once(lane_steps)
     mean = steps[1] / (seeds * episodes)
     test = f"{seeds} × {episodes} episodes of {mean:.0f} steps, {_steering(bench)}"
     return Probe(lambda _: steps[useful], test)
 
 
-def _test(bench: Bench) -> tuple[Test, Scenarios]:
-    return Test(lanes=bench.options.wide), scenarios(bench.robot, *bench.options.bank)
+def _test(bench: Bench) -> tuple[EvaluationSettings, Scenarios]:
+    return EvaluationSettings(num_envs=bench.options.wide), scenarios(
+        bench.robot, *bench.options.scenarios
+    )
 
 
 def _steering(bench: Bench) -> str:

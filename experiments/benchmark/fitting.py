@@ -52,7 +52,7 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
     keys = jax.random.split(jax.random.key(0), 3)
     weights = _weights(keys[0], psi), _weights(keys[1], phi)
     views = 2 if psi else 1
-    x = jax.random.normal(keys[2], (views, settings.batch, (psi or phi)[0][0]))
+    x = jax.random.normal(keys[2], (views, settings.batch_size, (psi or phi)[0][0]))
 
     def loss(weights: tuple[list[jax.Array], list[jax.Array]], x: jax.Array) -> jax.Array:
         gamma = functools.reduce(jnp.matmul, weights[0], x).mean(0)
@@ -84,4 +84,4 @@ def _weights(key: jax.Array, shapes: Sequence[Shape]) -> list[jax.Array]:
 def _networks(settings: Fit) -> str:
     shown = {"LFM": settings.lfm if settings.latent_size else (), "IDM": settings.idm}
     networks = [f"{k} {'×'.join(map(str, widths))}" for k, widths in shown.items() if widths]
-    return f"batch {settings.batch}, {', '.join(networks)}"
+    return f"batch {settings.batch_size}, {', '.join(networks)}"

@@ -41,7 +41,7 @@ def envpool(bench: Bench, *, wide: bool = False) -> Probe:
       wide: as many environments as 𝒢 and evaluation have lanes.
     """
     _need(["envpool"])
-    lanes, threads = bench.lanes(wide), devices.cores()
+    lanes, threads = bench.num_envs(wide), devices.cores()
     # An extra that may be absent: imported by name, so that the types are checked without it.
     pool = importlib.import_module("envpool").make_gymnasium(
         "Ant-v5", num_envs=lanes, num_threads=threads, seed=0

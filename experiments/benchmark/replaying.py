@@ -20,7 +20,7 @@ def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
       bench: sizes.
       program_alone: leave out the sending and bringing back.
     """
-    lanes = bench.robot.at_once(bench.options.wide)
+    lanes = bench.robot.max_parallel_envs(bench.options.wide)
     blocks = Blocks(bench.once(record), segment(bench), lanes, bench.mesh.size)
     key = jax.random.key(0)
     keys, block = blocks.example(key)

@@ -23,12 +23,12 @@ from experiments.benchmark.starting import starting
 from experiments.benchmark.stepping import batch, limit, stepping
 from genidm.agents.frozen import Frozen
 from genidm.errors import BadInput
-from genidm.paper.methods import GE, HER_DE, HER_SP, LR, RL, RS, Inverse, Method, by_name
+from genidm.paper.methods import GE, HER_DE, HER_SP, LR, RL, RS, InverseDynamics, Method, by_name
 
 
-def _of_humanoid(name: str) -> Inverse:
+def _of_humanoid(name: str) -> InverseDynamics:
     method = by_name(name, "humanoid")
-    assert isinstance(method, Inverse)
+    assert isinstance(method, InverseDynamics)
     return method
 
 
@@ -60,7 +60,7 @@ def _halves(method: Method) -> tuple[Row, Row, Row]:
     return learning, walk, loop
 
 
-def _fits(method: Inverse) -> tuple[Row, Row]:
+def _fits(method: InverseDynamics) -> tuple[Row, Row]:
     """A method's fit beside its matrix products alone."""
     name, settings = f"fit of {method.name}", method.fit
     products = Row(f"{name}, products alone", "updates/s", _P(multiplying, settings=settings))

@@ -13,7 +13,7 @@ from mujoco.batch import Batch
 from experiments.benchmark.bench import Bench, counted
 from experiments.benchmark.measuring import Probe, Skip, carried, timed
 from genidm import devices
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.engines.base import Physics
 from genidm.engines.mujoco import MuJoCo
 from genidm.robots import Robot, State, remade
@@ -31,7 +31,7 @@ def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Pr
       wide: as many lanes as 𝒢 and evaluation have.
       threads: one for each core, unless given.
     """
-    robot, lanes = on_engine(bench, "mujoco"), bench.lanes(wide)
+    robot, lanes = on_engine(bench, "mujoco"), bench.num_envs(wide)
     assert isinstance(robot, MujocoRobot)
     threads = threads or devices.cores()
     if threads > devices.cores():
@@ -53,7 +53,7 @@ def step_batch(robot: MujocoRobot, simulations: Batch, actions: np.ndarray) -> N
     """The control steps of actions `[T, B, A]`, by `mujoco.batch` and nothing else."""
     for action in actions:
         simulations.ctrl = action
-        simulations.step(nstep=robot.frames)
+        simulations.step(nstep=robot.frame_skip)
 
 
 def stepping(
@@ -67,7 +67,7 @@ def stepping(
       wide: as many lanes as 𝒢 and evaluation have.
       count: devices; as many as the engine asks for, unless given.
     """
-    robot, lanes = on_engine(bench, engine) if engine else bench.robot, bench.lanes(wide)
+    robot, lanes = on_engine(bench, engine) if engine else bench.robot, bench.num_envs(wide)
     if (count or 0) > jax.device_count():
         raise Skip(f"it needs {count} devices, and there are {jax.device_count()}")
     mesh = devices.mesh(jax.devices()[:count]) if count else robot.mesh()
@@ -108,7 +108,7 @@ def on_engine(bench: Bench, name: str) -> Robot:
     robot = bench.robot
     if name not in robot.engines:
         raise Skip(f"the {robot.name} is not stepped by {name}")
-    return remade(plain(robot.settings) | {"engine": name})
+    return remade(to_json(robot.settings) | {"engine": name})
 
 
 def among(robot: Robot, mesh: Mesh) -> str:

@@ -22,7 +22,7 @@ from genidm.engines import ENGINES
 from genidm.errors import BadInput
 from genidm.progress import METRICS, read_metrics
 from genidm.robots import ROBOTS
-from genidm.runs.command import guarded
+from genidm.runs.command import run_cli
 
 # Robot → its cells of the paper's scale, in order. Cells that share a record follow each other.
 CELLS = {"ant": ("LR", "GE", "RL", "HF")}
@@ -217,4 +217,4 @@ def gpu(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None
 
 
 if __name__ == "__main__":
-    guarded(gpu, "Tries, measures and uses a GPU, within a time limit.")
+    run_cli(gpu, "Tries, measures and uses a GPU, within a time limit.")

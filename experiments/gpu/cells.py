@@ -14,33 +14,33 @@ import numpy as np
 from experiments.benchmark.starting import compiling
 from experiments.gpu.results import Results
 from genidm import files
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import Inverse, by_name
+from genidm.paper.methods import InverseDynamics, by_name
 from genidm.robots import Robot
-from genidm.runs.cell import bank_of, cell, run_cell
+from genidm.runs.cell import make_run, run_method, scenarios_of
 from genidm.runs.resolve import Options
-from genidm.runs.run import Cell, InverseCell
+from genidm.runs.run import InverseDynamicsRun, Run
 from genidm.store import Stage
 
 # Interactions of the tiny cell: an off-policy learner makes its first updates before they end.
 # The programs that collect are those of the paper's scale, and lie in the cache afterwards.
 INTERACTIONS = 20_000
 EPISODES = 2
-TEST = Test(max_steps=40, chunk=10)
+TEST = EvaluationSettings(max_steps=40, chunk=10)
 # An agent that has just begun falls before it has come farther.
-LOOK_AHEAD = 5
+GOAL_HORIZON = 5
 
 
 def trial(robot: Robot) -> dict[str, Any]:
     """LR, end to end, at a tiny scale; seconds in all, and in XLA's compiler."""
     method = by_name("LR", robot.name)
-    assert isinstance(method, Inverse)
-    method = dataclasses.replace(method, look_ahead=LOOK_AHEAD)
+    assert isinstance(method, InverseDynamics)
+    method = dataclasses.replace(method, goal_horizon=GOAL_HORIZON)
     with tempfile.TemporaryDirectory(prefix="genidm-") as out, compiling() as counted:
         scale = str(INTERACTIONS / robot.paper_interactions)
-        options = Options(scale=scale, out=Path(out), episodes=EPISODES, test=TEST)
-        print((run_cell(robot, method, options) / "table.txt").read_text(encoding="utf-8"))
+        options = Options(scale=scale, run_dir=Path(out), episodes=EPISODES, test=TEST)
+        print((run_method(robot, method, options) / "table.txt").read_text(encoding="utf-8"))
     return {"seconds": round(counted["wall"], 1), "compiling": round(counted["seconds"], 1)}
 
 
@@ -72,35 +72,35 @@ def run(robot: Robot, method: str, options: Options, results: Results) -> dict[s
     Returns:
       what its test came to, and the seconds that its parts took, over all calls.
     """
-    this = cell(robot, by_name(method, robot.name), options)
-    bank = bank_of(this, options)
-    parts = list(_parts(this, bank))
+    this = make_run(robot, by_name(method, robot.name), options)
+    scenarios = scenarios_of(this, options)
+    parts = list(_parts(this, scenarios))
     for part in parts:
         _do(results, {"robot": robot.name, "method": method}, part)
     rows = (results.find("stages", {"robot": robot.name, "stage": p.stage}) for p in parts)
     seconds = sum(row["seconds"] for row in rows if row)
-    return _outcome(this.episodes(bank)) | {"seconds": round(seconds, 1)}
+    return _outcome(this.run_test(scenarios)) | {"seconds": round(seconds, 1)}
 
 
-def _parts(this: Cell[Any], bank: Scenarios) -> Iterator[Part]:
+def _parts(this: Run[Any], scenarios: Scenarios) -> Iterator[Part]:
     """The parts of a cell, in the order that they need each other."""
 
     def part(name: str, stage: Stage, work: Callable[[], Any]) -> Part:
         return Part(name, stage.directory.name, stage.done, work)
 
-    if isinstance(this, InverseCell):
-        share = this.method.share
+    if isinstance(this, InverseDynamicsRun):
+        share = this.method.fraction
         yield part("collecting", this.experience_stage, this.experience)
         if this.replay_stage:
 
             def again() -> Any:
-                return this.replay(this.experience().first_share(share))
+                return this.replay(this.experience().first_fraction(share))
 
             yield part("𝒢", this.replay_stage, again)
     learning = part("learning", this.controller_stage, this.controller)
     yield learning
     # Its stage is known once it is done; to ask for it again costs nothing.
-    yield Part("testing", f"test of {learning.stage}", False, lambda: this.episodes(bank))
+    yield Part("testing", f"test of {learning.stage}", False, lambda: this.run_test(scenarios))
 
 
 def _do(results: Results, names: dict[str, Any], part: Part) -> None:

@@ -20,7 +20,7 @@ from genidm.paper.methods import by_name
 from genidm.provenance import environment
 from genidm.robots import ROBOTS, Robot
 from genidm.robots import by_name as robot_by_name
-from genidm.runs.cell import bank_of, cell, write_report
+from genidm.runs.cell import make_run, scenarios_of, write_report
 from genidm.runs.resolve import Options
 
 
@@ -72,7 +72,7 @@ class Job:
     @property
     def options(self) -> Options:
         """Of a cell."""
-        return Options(scale=self.scale, out=Path(self.run_dir))
+        return Options(scale=self.scale, run_dir=Path(self.run_dir))
 
     @property
     def names(self) -> dict[str, Any]:
@@ -126,8 +126,8 @@ def report(job: Job) -> None:
     """The table of all cells that have ended."""
     robot = job.made()
     assert job.method
-    this = cell(robot, by_name(job.method, robot.name), job.options)
-    place = write_report(this, bank_of(this, job.options), job.options)
+    this = make_run(robot, by_name(job.method, robot.name), job.options)
+    place = write_report(this, scenarios_of(this, job.options), job.options)
     print((place / "table.txt").read_text(encoding="utf-8"))
     names = dict(robot=job.robot, engine=job.stepper, scale=job.scale)
     job.results.put("reports", names | {"place": str(place)})

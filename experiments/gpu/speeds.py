@@ -17,8 +17,8 @@ from experiments.benchmark.measuring import carried
 from experiments.gpu.results import Row
 from genidm import devices
 from genidm.controller import Controller
-from genidm.evaluation.evaluate import Test, flatten
-from genidm.evaluation.evaluator import Evaluator, Queue
+from genidm.evaluation.evaluate import EvaluationSettings, flatten
+from genidm.evaluation.evaluator import EvaluationState, Evaluator
 from genidm.evaluation.scenarios import scenarios
 from genidm.paper.idm import Architecture
 from genidm.paper.methods import LR
@@ -84,12 +84,14 @@ def generalizing(robot: Robot, lanes: int) -> Probe:
 
 def testing(robot: Robot, lanes: int) -> Probe:
     """The test with an untrained LR; a scenario for each lane, so that all have one."""
-    bank = flatten(scenarios(robot, 1, lanes))
-    test = Evaluator(robot, bank, Test(lanes=lanes, chunk=STEPS), robot.mesh())
+    test_scenarios = flatten(scenarios(robot, 1, lanes))
+    test = Evaluator(
+        robot, test_scenarios, EvaluationSettings(num_envs=lanes, chunk=STEPS), robot.mesh()
+    )
     queue = test.start()
     program = test.prepare(_untrained(robot), queue)
 
-    def step(queue: Queue) -> Queue:
+    def step(queue: EvaluationState) -> EvaluationState:
         queue = program(queue)
         return test.start() if test.ended(queue) == test.total else queue
 

@@ -25,7 +25,7 @@ class Learning(NamedTuple):
       place: learner → the same learner on its devices, from wherever it was.
       prepare: learner → `iterate`: compiles the agent's programs for a placed learner.
         `iterate` takes a learner, which it donates, to (learner, Experience
-        `[unroll, lanes, ...]` on the devices, metrics).
+        `[unroll_length, lanes, ...]` on the devices, metrics).
     """
 
     start: Callable[[jax.Array], Any]
@@ -37,14 +37,14 @@ class Agent(Protocol):
     """Settings of an agent: a frozen dataclass.
 
     Attributes:
-      lanes: robots at once.
-      unroll: steps an iteration.
+      num_envs: robots at once.
+      unroll_length: steps an iteration.
     """
 
     @property
-    def lanes(self) -> int: ...
+    def num_envs(self) -> int: ...
     @property
-    def unroll(self) -> int: ...
+    def unroll_length(self) -> int: ...
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         """The agent on this robot, its lanes sharded over the mesh."""

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 
 from genidm.errors import BadInput
 from genidm.robots.base import Robot
-from genidm.tasks import Step
+from genidm.tasks import Transition
 
 
-class Memory(flax.struct.PyTreeNode):
+class ReplayTransition(flax.struct.PyTreeNode):
     """What is remembered of steps `[...]`; the state after one is s of the next row.
 
     Attributes:
@@ -29,11 +29,11 @@ class Memory(flax.struct.PyTreeNode):
       goal: `[..., 3]`, metres, world frame; None where the task has none.
       cost: control and contact costs.
       fallen: bool, the robot fell, or its physics diverged.
-      reward: see `Step`.
-      rest: see `Step`.
-      terminal: see `Step`.
-      last: see `Step`.
-      age: see `Step`.
+      reward: see `Transition`.
+      absorbing_reward: see `Transition`.
+      terminal: see `Transition`.
+      last: see `Transition`.
+      episode_step: see `Transition`.
     """
 
     s: Any
@@ -44,15 +44,15 @@ class Memory(flax.struct.PyTreeNode):
     cost: Any
     fallen: Any
     reward: Any
-    rest: Any
+    absorbing_reward: Any
     terminal: Any
     last: Any
-    age: Any
+    episode_step: Any
 
 
-def remember(robot: Robot, step: Step) -> Memory:
+def to_replay_transition(robot: Robot, step: Transition) -> ReplayTransition:
     """The memory of one transition of B lanes, `[B, ...]`."""
-    return Memory(
+    return ReplayTransition(
         s=step.before.observation,
         o=step.before.position,
         o_next=step.after.position,
@@ -61,10 +61,10 @@ def remember(robot: Robot, step: Step) -> Memory:
         cost=robot.cost(step.after, step.action),
         fallen=step.after.fallen | step.after.diverged,
         reward=step.reward,
-        rest=step.rest,
+        absorbing_reward=step.absorbing_reward,
         terminal=step.terminal,
         last=step.last,
-        age=step.age,
+        episode_step=step.episode_step,
     )
 
 
@@ -72,11 +72,11 @@ class Buffer(flax.struct.PyTreeNode):
     """The newest T steps of B lanes.
 
     Attributes:
-      rows: Memory `[T, B, ...]`, a ring: row n of all that were written lies at n mod T.
+      rows: ReplayTransition `[T, B, ...]`, a ring: row n of all that were written lies at n mod T.
       written: int32, rows since the start.
     """
 
-    rows: Memory
+    rows: ReplayTransition
     written: jax.Array
 
     @property
@@ -97,25 +97,26 @@ class Index(NamedTuple):
     lane: jax.Array
 
 
-def empty(part: Memory, capacity: int) -> Buffer:
+def empty(part: ReplayTransition, max_replay_size: int) -> Buffer:
     """A buffer for parts like this one.
 
     Args:
-      part: Memory `[U, B, ...]`, or its shapes.
-      capacity: steps, over all lanes; rounded down to whole parts.
+      part: ReplayTransition `[U, B, ...]`, or its shapes.
+      max_replay_size: steps, over all lanes; rounded down to whole parts.
 
     Raises:
       BadInput: not even two parts fit.
     """
-    unroll, lanes = part.last.shape
-    rows = capacity // (unroll * lanes) * unroll
-    if rows < 2 * unroll:
-        raise BadInput(f"a buffer for {capacity} steps holds no two iterations of {unroll * lanes}")
+    unroll_length, lanes = part.last.shape
+    rows = max_replay_size // (unroll_length * lanes) * unroll_length
+    if rows < 2 * unroll_length:
+        size = unroll_length * lanes
+        raise BadInput(f"a buffer for {max_replay_size} steps holds no two iterations of {size}")
     blank = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), part)
     return Buffer(blank, jnp.zeros((), jnp.int32))
 
 
-def insert(buffer: Buffer, part: Memory) -> Buffer:
+def add(buffer: Buffer, part: ReplayTransition) -> Buffer:
     """The buffer with a part `[U, B, ...]` in the place of its oldest rows; U divides T."""
     row = buffer.written % buffer.rows.last.shape[0]
 
@@ -127,7 +128,7 @@ def insert(buffer: Buffer, part: Memory) -> Buffer:
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def newest(buffer: Buffer, count: int) -> Memory:
+def newest(buffer: Buffer, count: int) -> ReplayTransition:
     """The newest rows `[count, B, ...]`, in the order that they were written in."""
     row = (buffer.written - count + jnp.arange(count)) % buffer.rows.last.shape[0]
     return jax.tree.map(lambda x: x[row], buffer.rows)
@@ -143,7 +144,7 @@ def steps_left(buffer: Buffer) -> jax.Array:
     return jnp.roll(end - time, buffer.oldest, axis=0)
 
 
-def draw(buffer: Buffer, key: jax.Array, size: int) -> Index:
+def sample_index(buffer: Buffer, key: jax.Array, size: int) -> Index:
     """Steps drawn evenly from all but the newest row, which nothing follows yet."""
     rows, lanes = buffer.rows.last.shape
     which, where = jax.random.split(key)
@@ -151,7 +152,7 @@ def draw(buffer: Buffer, key: jax.Array, size: int) -> Index:
     return Index((buffer.oldest + row) % rows, jax.random.randint(where, (size,), 0, lanes))
 
 
-def look_up(buffer: Buffer, at: Index) -> tuple[Memory, jax.Array]:
+def gather(buffer: Buffer, at: Index) -> tuple[ReplayTransition, jax.Array]:
     """The steps `[N, ...]` at an index, and the states `[N, S]` in the rows after them.
 
     Where a step is the last of its episode, the row after it is the start of another.

@@ -18,7 +18,7 @@ from genidm.experience import Experience, concatenate, load
 from genidm.progress import Progress
 from genidm.robots.base import Robot
 from genidm.store import Stage
-from genidm.tasks import Lanes, Task, WalkForward
+from genidm.tasks import EnvState, Task, WalkForward
 
 # Transitions that are written to disk at a time.
 CHUNK = 1 << 17
@@ -61,11 +61,11 @@ def collect(
     Raises:
       BadInput: what the learner has learned is not finite; nothing of that is kept.
     """
-    mesh = mesh or devices.dividing(robot.mesh(), agent.lanes)
+    mesh = mesh or devices.dividing(robot.mesh(), agent.num_envs)
     _check(agent, interactions, seed, mesh)
     learning = agent.learning(robot, task or WalkForward(), mesh)
     learner = learning.place(jax.jit(learning.start)(jax.random.key(seed)))
-    size = agent.lanes * agent.unroll
+    size = agent.num_envs * agent.unroll_length
     iterations = whole(agent, interactions) // size
     log = _Log(robot, stage, max(1, CHUNK // size), keep)
     done, learner = log.resume(learner, learning)
@@ -86,21 +86,23 @@ def collect(
 
 def whole(agent: Agent, interactions: int) -> int:
     """Interactions, rounded up to a whole iteration of the agent: what `collect` makes."""
-    size = agent.lanes * agent.unroll
+    size = agent.num_envs * agent.unroll_length
     return -(-interactions // size) * size
 
 
 def _check(agent: Agent, interactions: int, seed: int, mesh: Mesh) -> None:
     check_value("interactions", interactions, count())
     check_value("seed", seed, checks.seed())
-    check_value("lanes × unroll", agent.lanes * agent.unroll, count(1, MOST_AT_ONCE))
-    if agent.lanes % mesh.size:
-        raise BadInput(f"{agent.lanes} lanes cannot be shared among {mesh.size} devices evenly")
+    check_value(
+        "lanes × unroll_length", agent.num_envs * agent.unroll_length, count(1, MOST_AT_ONCE)
+    )
+    if agent.num_envs % mesh.size:
+        raise BadInput(f"{agent.num_envs} lanes cannot be shared among {mesh.size} devices evenly")
 
 
 def _check_learned(learner: Any, interactions: int) -> None:
     """Refuses parameters, or what else is learned, that are not finite."""
-    still = Lanes | Buffer  # robots, and what they did: NaN never gets there
+    still = EnvState | Buffer  # robots, and what they did: NaN never gets there
     learned = jax.tree.map(
         lambda x: None if isinstance(x, still) else x,
         learner,

@@ -12,7 +12,7 @@ import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.gradients import gradient_update_fn
 from brax.training.networks import FeedForwardNetwork, make_policy_network, make_q_network
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 
 from genidm.agents.base import Metrics
 from genidm.agents.off_policy import Algorithm, OffPolicy
@@ -21,7 +21,7 @@ from genidm.checks import check, number
 from genidm.robots.base import Robot
 
 
-class Networks(flax.struct.PyTreeNode):
+class DDPGState(flax.struct.PyTreeNode):
     """Parameters of policy and critic, their targets, and the optimizers."""
 
     policy: Any
@@ -55,8 +55,8 @@ class DDPG(OffPolicy):
         """Brax's policy (before tanh) and critic, on normalised inputs."""
         actions = robot.action.size
         return (
-            make_policy_network(actions, size, normalize, self.hidden),
-            make_q_network(size, actions, normalize, self.critic_hidden, n_critics=1),
+            make_policy_network(actions, size, normalize, self.policy_hidden_layer_sizes),
+            make_q_network(size, actions, normalize, self.critic_hidden_layer_sizes, n_critics=1),
         )
 
     def loss_critic(
@@ -65,14 +65,14 @@ class DDPG(OffPolicy):
         networks: tuple[FeedForwardNetwork, FeedForwardNetwork],
         targets: tuple[Any, Any],
         statistics: RunningStatisticsState,
-        batch: Transition,
+        batch: BraxTransition,
     ) -> jax.Array:
         """Half the mean square of Q(x, a) − (r + γ Q'(x', μ'(x'))); truncated steps count 0."""
         mu, q = networks
         action = jnp.tanh(mu.apply(statistics, targets[0], batch.next_observation))
         following = q.apply(statistics, targets[1], batch.next_observation, action)[..., 0]
-        reward = self.reward_scale * batch.reward
-        target = reward + self.discount * batch.discount * following
+        reward = self.reward_scaling * batch.reward
+        target = reward + self.discounting * batch.discount * following
         here = q.apply(statistics, critic, batch.observation, batch.action)[..., 0]
         kept = 1 - batch.extras["state_extras"]["truncation"]
         return 0.5 * jnp.mean((kept * (here - target)) ** 2)
@@ -83,7 +83,7 @@ class DDPG(OffPolicy):
         networks: tuple[FeedForwardNetwork, FeedForwardNetwork],
         critic: Any,
         statistics: RunningStatisticsState,
-        batch: Transition,
+        batch: BraxTransition,
     ) -> jax.Array:
         """−Q(x, μ(x)), batch mean, and the actions' cost."""
         mu, q = networks
@@ -104,12 +104,12 @@ class DDPG(OffPolicy):
         critic_update = gradient_update_fn(loss_critic, adam, pmap_axis_name=None)
         policy_update = gradient_update_fn(loss_policy, adam, pmap_axis_name=None)
 
-        def start(key: jax.Array) -> Networks:
+        def start(key: jax.Array) -> DDPGState:
             keys = jax.random.split(key)
             params = [net.init(k) for net, k in zip(networks, keys, strict=True)]
             # Targets are copies: one buffer cannot be donated twice.
             targets = jax.tree.map(jnp.copy, params)
-            return Networks(*params, *targets, *(adam.init(p) for p in params))
+            return DDPGState(*params, *targets, *(adam.init(p) for p in params))
 
         def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             which, noise, anywhere = jax.random.split(key, 3)
@@ -126,8 +126,8 @@ class DDPG(OffPolicy):
             return jnp.where(explores[:, None], drawn, jnp.clip(action, -1.0, 1.0))
 
         def update(
-            n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
-        ) -> tuple[Networks, Metrics]:
+            n: DDPGState, statistics: RunningStatisticsState, batch: BraxTransition, key: jax.Array
+        ) -> tuple[DDPGState, Metrics]:
             critic_loss, critic, critic_state = critic_update(
                 n.critic, (n.policy_target, n.critic_target), statistics, batch,
                 optimizer_state=n.critic_optimizer,
@@ -138,7 +138,9 @@ class DDPG(OffPolicy):
             policy_target, critic_target = optax.incremental_update(
                 (policy, critic), (n.policy_target, n.critic_target), self.tau
             )
-            new = Networks(policy, critic, policy_target, critic_target, policy_state, critic_state)
+            new = DDPGState(
+                policy, critic, policy_target, critic_target, policy_state, critic_state
+            )
             return new, {"critic_loss": critic_loss, "policy_loss": policy_loss}
 
         return Algorithm(start, draw, act, update)

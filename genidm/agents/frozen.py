@@ -16,9 +16,9 @@ from genidm.agents.ppo import PPO
 from genidm.agents.sac import SAC
 from genidm.checks import check, number
 from genidm.experience import Experience
-from genidm.progress import compiled
+from genidm.progress import compile_ahead
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Task, input_size
+from genidm.tasks import EnvState, Task, input_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,18 +30,18 @@ class Frozen:
 
     Attributes:
       agent: what learns.
-      share: of the interactions that it learns from.
+      fraction: of the interactions that it learns from.
     """
 
     agent: PPO | SAC
-    share: float
+    fraction: float
 
     def __post_init__(self) -> None:
-        check(self, share=number(0, 1, above=True, below=True))
+        check(self, fraction=number(0, 1, above=True, below=True))
 
-    def wide(self) -> Frozen:
-        """The same with a wide agent, where it can be (`OffPolicy.wide`)."""
-        wide = self.agent.wide() if isinstance(self.agent, OffPolicy) else self.agent
+    def for_accelerator(self) -> Frozen:
+        """The same with its agent's settings for an accelerator (`OffPolicy.for_accelerator`)."""
+        wide = self.agent.for_accelerator() if isinstance(self.agent, OffPolicy) else self.agent
         return dataclasses.replace(self, agent=wide)
 
 
@@ -58,12 +58,12 @@ class Acting:
     learned: Policy
 
     @property
-    def lanes(self) -> int:
-        return self.agent.lanes
+    def num_envs(self) -> int:
+        return self.agent.num_envs
 
     @property
-    def unroll(self) -> int:
-        return self.agent.unroll
+    def unroll_length(self) -> int:
+        return self.agent.unroll_length
 
     def policy(self, robot: Robot, task: Task, learner: Any) -> Policy:
         """The policy that it was given."""
@@ -74,16 +74,16 @@ class Acting:
         stepping = self.agent.programs(robot, task, mesh).stepping
         statistics = no_statistics(input_size(robot, task))
         statistics = statistics.replace(mean=self.learned.mean, std=self.learned.std)
-        chosen = devices.put((statistics, self.learned.params), mesh, None)
+        actor_params = devices.put((statistics, self.learned.params), mesh, None)
 
-        def start(key: jax.Array) -> Lanes:
-            return task.start(robot, jax.random.split(key, self.lanes))
+        def start(key: jax.Array) -> EnvState:
+            return task.start(robot, jax.random.split(key, self.num_envs))
 
-        def prepare(lanes: Lanes) -> Iterate:
-            program = compiled("a frozen agent's stepping", stepping, *chosen, lanes)
+        def prepare(lanes: EnvState) -> Iterate:
+            program = compile_ahead("a frozen agent's stepping", stepping, *actor_params, lanes)
 
-            def iterate(lanes: Lanes) -> tuple[Lanes, Experience, Metrics]:
-                lanes, experience, _, seen = program(*chosen, lanes)
+            def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
+                lanes, experience, _, seen = program(*actor_params, lanes)
                 return lanes, experience, seen
 
             return iterate

@@ -19,22 +19,22 @@ class HER:
     """Settings of the relabelling.
 
     Attributes:
-      strategy: goals are positions after this step in its episode ("future"), the last one
-        of the episode ("final"), or any of it ("episode"). Of an episode that is not over,
+      goal_selection_strategy: goals are positions after this step in its episode ("future"), the
+        last one of the episode ("final"), or any of it ("episode"). Of an episode that is not over,
         what has happened so far counts.
-      goals: of each step drawn with its own goal, this many are drawn with another.
+      n_sampled_goal: of each step drawn with its own goal, this many are drawn with another.
     """
 
-    strategy: Strategy = "future"
-    goals: int = 4
+    goal_selection_strategy: Strategy = "future"
+    n_sampled_goal: int = 4
 
     def __post_init__(self) -> None:
-        check(self, goals=count())
+        check(self, n_sampled_goal=count())
 
     def goal(
         self, buffer: Buffer, left: jax.Array, at: Index, key: jax.Array, height: float
     ) -> jax.Array:
-        """Goals `[N, 3]` for the steps at an index, goals / (goals + 1) of them relabelled.
+        """Goals `[N, 3]` for the steps at an index, `n_sampled_goal` of n + 1 relabelled.
 
         Args:
           buffer: what happened.
@@ -44,8 +44,8 @@ class HER:
           height: metres; goals are given it, as all goals of the task have it.
         """
         which, when = jax.random.split(key)
-        relabelled = jax.random.uniform(which, at.row.shape, jnp.float32) < self.goals / (
-            self.goals + 1
+        relabelled = jax.random.uniform(which, at.row.shape, jnp.float32) < self.n_sampled_goal / (
+            self.n_sampled_goal + 1
         )
         first, last = self._window(buffer, left, at)
         offset = jax.random.randint(when, at.row.shape, first, last + 1)
@@ -56,9 +56,9 @@ class HER:
     def _window(self, buffer: Buffer, left: jax.Array, at: Index) -> tuple[jax.Array, jax.Array]:
         """First and last step `[N]` whose outcome may be the goal, counted from this step."""
         left = left[at.row, at.lane]
-        if self.strategy == "future":
+        if self.goal_selection_strategy == "future":
             return jnp.zeros_like(left), left
-        if self.strategy == "final":
+        if self.goal_selection_strategy == "final":
             return left, left
         kept = (at.row - buffer.oldest) % buffer.rows.last.shape[0]  # rows before it
-        return -jnp.minimum(buffer.rows.age[at.row, at.lane], kept), left
+        return -jnp.minimum(buffer.rows.episode_step[at.row, at.lane], kept), left

@@ -1,8 +1,8 @@
 """The loop that SAC and DDPG share: step, remember, learn from a replay buffer.
 
 An iteration is two programs, as PPO's: in the first every device steps its own lanes; in
-the second the buffer takes the steps in and `updates` minibatches are learned from, on one
-device. What differs between learners is an `Algorithm`.
+the second the buffer takes the steps in and `grad_updates_per_step` minibatches are learned from,
+on one device. What differs between learners is an `Algorithm`.
 """
 
 from __future__ import annotations
@@ -18,30 +18,39 @@ import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.alternating import Alternates, Alternating, Learner
 from genidm.agents.base import Metrics
 from genidm.agents.buffer import (
     Buffer,
-    Memory,
-    draw,
+    ReplayTransition,
+    add,
     empty,
-    insert,
-    look_up,
-    remember,
+    gather,
+    sample_index,
     steps_left,
+    to_replay_transition,
 )  # fmt: skip
 from genidm.agents.her import HER
 from genidm.agents.policy import Activation, no_statistics
-from genidm.agents.walking import walk
+from genidm.agents.rollout_then_learn import AgentState, Alternates, RolloutThenLearn
+from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import GoToGoal, Lanes, Step, Task, Verdict, input_size, inputs, outlook
+from genidm.tasks import (
+    EnvState,
+    GoToGoal,
+    Outcome,
+    Task,
+    Transition,
+    bootstrapped_reward,
+    input_size,
+    inputs,
+)
 
 
 class Algorithm(NamedTuple):
@@ -52,7 +61,7 @@ class Algorithm(NamedTuple):
       draw: key → the random numbers that an action of one robot takes.
       act: (statistics, policy, inputs `[B, I]`, random numbers `[B, ...]`) → actions `[B, A]`,
         with exploration.
-      update: (tree, statistics, Transition `[N, ...]`, key) → (tree, losses).
+      update: (tree, statistics, BraxTransition `[N, ...]`, key) → (tree, losses).
     """
 
     start: Callable[[jax.Array], Any]
@@ -70,7 +79,7 @@ class TrainingState(flax.struct.PyTreeNode):
     key: jax.Array
 
     @property
-    def chosen(self) -> tuple[RunningStatisticsState, Any]:
+    def actor_params(self) -> tuple[RunningStatisticsState, Any]:
         """What chooses actions."""
         return self.statistics, self.networks.policy
 
@@ -80,61 +89,73 @@ class OffPolicy(Alternates):
     """Settings that off-policy learners share.
 
     Attributes:
-      lanes: robots at once.
-      unroll: steps an iteration.
-      updates: minibatches an iteration.
-      batch: steps a minibatch.
-      capacity: steps that the buffer holds.
-      warmup: steps before the first update.
+      num_envs: robots at once.
+      unroll_length: steps an iteration.
+      grad_updates_per_step: gradient updates an iteration, which is Brax's training step:
+        unroll_length steps of every environment.
+      batch_size: steps a minibatch.
+      max_replay_size: steps that the buffer holds.
+      min_replay_size: steps before the first update.
       learning_rate: of Adam.
-      discount: of rewards, a step.
+      discounting: of rewards, a step.
       tau: share of the networks in their targets, an update.
-      reward_scale: rewards are multiplied by it.
-      hidden: layers of the policy (Table 2: 64×64).
-      critic_hidden: layers of the critics.
+      reward_scaling: rewards are multiplied by it.
+      policy_hidden_layer_sizes: layers of the policy (Table 2: 64×64).
+      critic_hidden_layer_sizes: layers of the critics.
       her: relabelling; None learns from the task's own goals and rewards.
     """
 
     activation: ClassVar[Activation] = "relu"
 
-    lanes: int = 128
-    unroll: int = 8
-    updates: int = 128
-    batch: int = 256
-    capacity: int = 1_000_000
-    warmup: int = 10_000
+    num_envs: int = 128
+    unroll_length: int = 8
+    grad_updates_per_step: int = 128
+    batch_size: int = 256
+    max_replay_size: int = 1_000_000
+    min_replay_size: int = 10_000
     learning_rate: float = 1e-3
-    discount: float = 0.98
+    discounting: float = 0.98
     tau: float = 0.005
-    reward_scale: float = 1.0
-    hidden: tuple[int, ...] = (64, 64)
-    critic_hidden: tuple[int, ...] = (256, 256)
+    reward_scaling: float = 1.0
+    policy_hidden_layer_sizes: tuple[int, ...] = (64, 64)
+    critic_hidden_layer_sizes: tuple[int, ...] = (256, 256)
     her: HER | None = None
 
     def __post_init__(self) -> None:
         check(
-            self, lanes=count(), unroll=count(), updates=count(), batch=count(),
-            capacity=count(), warmup=count(0), learning_rate=positive(),
-            discount=number(0, 1, above=True, below=True), tau=positive(1),
-            reward_scale=positive(), hidden=layers, critic_hidden=layers,
-        )  # fmt: skip
-        size = self.lanes * self.unroll
-        if self.warmup > self.capacity // size * size:
-            room = f"a buffer for {self.capacity} steps"
-            raise BadInput(f"{room} never holds the {self.warmup} of the warmup")
+            self,
+            num_envs=count(),
+            unroll_length=count(),
+            grad_updates_per_step=count(),
+            batch_size=count(),
+            max_replay_size=count(),
+            min_replay_size=count(0),
+            learning_rate=positive(),
+            discounting=number(0, 1, above=True, below=True),
+            tau=positive(1),
+            reward_scaling=positive(),
+            policy_hidden_layer_sizes=layers,
+            critic_hidden_layer_sizes=layers,
+        )
+        size = self.num_envs * self.unroll_length
+        if self.min_replay_size > self.max_replay_size // size * size:
+            room = f"a buffer for {self.max_replay_size} steps"
+            raise BadInput(f"{room} never holds the {self.min_replay_size} of min_replay_size")
 
-    def wide(self) -> Self:
+    def for_accelerator(self) -> Self:
         """The same with one step of many robots an iteration, which an accelerator makes at once.
 
         As many steps lie between updates as before, and the policy that makes them is newer.
         """
-        return dataclasses.replace(self, lanes=self.lanes * self.unroll, unroll=1)
+        return dataclasses.replace(
+            self, num_envs=self.num_envs * self.unroll_length, unroll_length=1
+        )
 
     @abc.abstractmethod
     def algorithm(self, robot: Robot, size: int) -> Algorithm:
         """The learner's networks and losses, for inputs of this size."""
 
-    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
         """The two programs of an iteration.
 
         Raises:
@@ -143,26 +164,31 @@ class OffPolicy(Alternates):
         if self.her and not isinstance(task, GoToGoal):
             raise BadInput("HER relabels goals, and this task has none")
         algorithm = self.algorithm(robot, input_size(robot, task))
-        walk = functools.partial(_walk, robot, task, algorithm, self.unroll)
+        rollout = functools.partial(_rollout, robot, task, algorithm, self.unroll_length)
         learn = functools.partial(self._learn, robot, task, algorithm)
 
-        def start(key: jax.Array) -> Learner:
+        def start(key: jax.Array) -> AgentState:
             keys = jax.random.split(key, 3)
-            lanes = task.start(robot, jax.random.split(keys[0], self.lanes))
+            lanes = task.start(robot, jax.random.split(keys[0], self.num_envs))
             networks = algorithm.start(keys[1])
             statistics = no_statistics(input_size(robot, task))
-            part = jax.eval_shape(walk, statistics, networks.policy, lanes)[2]
-            buffer = empty(part, self.capacity)
+            part = jax.eval_shape(rollout, statistics, networks.policy, lanes)[2]
+            buffer = empty(part, self.max_replay_size)
             _check_room(buffer)
-            return Learner(lanes, TrainingState(networks, statistics, buffer, keys[2]))
+            return AgentState(lanes, TrainingState(networks, statistics, buffer, keys[2]))
 
-        return Alternating(type(self).__name__, start, walk, learn, mesh)
+        return RolloutThenLearn(type(self).__name__, start, rollout, learn, mesh)
 
     def _learn(
-        self, robot: Robot, task: Task, algorithm: Algorithm, training: TrainingState, part: Memory
+        self,
+        robot: Robot,
+        task: Task,
+        algorithm: Algorithm,
+        training: TrainingState,
+        part: ReplayTransition,
     ) -> tuple[TrainingState, Metrics]:
-        """Takes `part [unroll, lanes, ...]` in, and learns from `updates` minibatches."""
-        buffer = insert(training.buffer, part)
+        """Takes `part [unroll_length, lanes, ...]` in; makes `grad_updates_per_step` updates."""
+        buffer = add(training.buffer, part)
         fed = inputs(part.s, None if part.goal is None else part.goal - part.o)
         statistics = running_statistics.update(training.statistics, fed)
         left = steps_left(buffer)
@@ -181,34 +207,34 @@ class OffPolicy(Alternates):
             return tree, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), info)
 
         key, stream = jax.random.split(training.key)
-        ready = buffer.filled * self.lanes >= max(self.warmup, 2 * self.lanes)
-        keys = jax.random.split(stream, self.updates)
+        ready = buffer.filled * self.num_envs >= max(self.min_replay_size, 2 * self.num_envs)
+        keys = jax.random.split(stream, self.grad_updates_per_step)
         tree, info = jax.lax.cond(ready, learn, wait, training.networks, keys)
         return TrainingState(tree, statistics, buffer, key), info
 
     def sample(
         self, robot: Robot, task: Task, buffer: Buffer, left: jax.Array, key: jax.Array
-    ) -> Transition:
+    ) -> BraxTransition:
         """A minibatch `[batch, ...]`, its goals relabelled if there is HER, and judged anew.
 
         A step at the time limit is no end: it is marked as truncated, and not learned from.
         """
         where, what = jax.random.split(key)
-        at = draw(buffer, where, self.batch)
-        rows, s_next = look_up(buffer, at)
-        goal, verdict = rows.goal, Verdict(rows.reward, rows.terminal, rows.rest)
+        at = sample_index(buffer, where, self.batch_size)
+        rows, s_next = gather(buffer, at)
+        goal, outcome = rows.goal, Outcome(rows.reward, rows.terminal, rows.absorbing_reward)
         if self.her:
             assert isinstance(task, GoToGoal)  # `learning` has refused the others
             goal = self.her.goal(buffer, left, at, what, robot.standing_height)
-            verdict = task.verdict(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
+            outcome = task.outcome(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
         before, after = (None, None) if goal is None else (goal - rows.o, goal - rows.o_next)
-        return Transition(
+        return BraxTransition(
             observation=inputs(rows.s, before),
             action=rows.a,
-            reward=outlook(verdict, self.discount),
-            discount=1.0 - verdict.terminal,
+            reward=bootstrapped_reward(outcome, self.discounting),
+            discount=1.0 - outcome.terminal,
             next_observation=inputs(s_next, after),
-            extras={"state_extras": {"truncation": 1.0 * (rows.last & ~verdict.terminal)}},
+            extras={"state_extras": {"truncation": 1.0 * (rows.last & ~outcome.terminal)}},
         )
 
 
@@ -217,24 +243,24 @@ def _check_room(buffer: Buffer) -> None:
     room = devices.memory() or devices.host_memory()
     if 1.2 * size > room:
         needs = f"the replay buffer needs {size / 1e9:.1f} GB, of {room / 1e9:.1f} on the device"
-        raise BadInput(f"{needs}: give the agent a smaller capacity")
+        raise BadInput(f"{needs}: give the agent a smaller max_replay_size")
 
 
-def _walk(
+def _rollout(
     robot: Robot,
     task: Task,
     algorithm: Algorithm,
-    unroll: int,
+    unroll_length: int,
     statistics: RunningStatisticsState,
     policy: Any,
-    lanes: Lanes,
-) -> tuple[Lanes, Experience, Memory, Metrics]:
-    """`unroll` steps of every lane, exploring; outputs `[unroll, B, ...]`."""
+    lanes: EnvState,
+) -> tuple[EnvState, Experience, ReplayTransition, Metrics]:
+    """`unroll_length` steps of every lane, exploring; outputs `[unroll_length, B, ...]`."""
 
     def choose(x: jax.Array, noise: Any) -> tuple[jax.Array, None]:
         return algorithm.act(statistics, policy, x, noise), None
 
-    def keep(step: Step, notes: None) -> Memory:
-        return remember(robot, step)
+    def keep(step: Transition, notes: None) -> ReplayTransition:
+        return to_replay_transition(robot, step)
 
-    return walk(robot, task, unroll, algorithm.draw, choose, keep, lanes)
+    return generate_unroll(robot, task, unroll_length, algorithm.draw, choose, keep, lanes)

@@ -53,42 +53,44 @@ class Policy(flax.struct.PyTreeNode):
       params: of Brax's policy network; its first A outputs are the mean.
       mean: `[I]`, of the inputs seen while learning.
       std: `[I]`.
-      hidden: layers of the network.
+      policy_hidden_layer_sizes: layers of the network.
       activation: of the hidden layers.
-      directed: fed (s, g − o); s alone otherwise.
+      goal_conditioned: fed (s, g − o); s alone otherwise.
       robot: the robot that it was trained on.
     """
 
     params: Any
     mean: jax.Array
     std: jax.Array
-    hidden: tuple[int, ...] = flax.struct.field(pytree_node=False)
+    policy_hidden_layer_sizes: tuple[int, ...] = flax.struct.field(pytree_node=False)
     activation: Activation = flax.struct.field(pytree_node=False)
-    directed: bool = flax.struct.field(pytree_node=False)
+    goal_conditioned: bool = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
 
-    def __call__(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+    def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` for states `[..., S]` and ways to the goal `[..., 3]`, metres.
 
         Raises:
           BadInput: their shapes do not fit the robot, or each other.
         """
-        s = self.robot.heard(s, displacement)
-        x = inputs(s, displacement if self.directed else None)
+        s = self.robot.check_inputs(s, relative_goal)
+        x = inputs(s, relative_goal if self.goal_conditioned else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
         out = self._network().apply(self.params, x)
         return jnp.tanh(out[..., : self.robot.action.size])
 
     def _network(self) -> MLP:
         """Its outputs are the mean and, of agents that explore by a Gaussian, the deviation."""
-        outputs = self.params["params"][f"hidden_{len(self.hidden)}"]["bias"].shape[-1]
+        outputs = self.params["params"][f"hidden_{len(self.policy_hidden_layer_sizes)}"][
+            "bias"
+        ].shape[-1]
         if outputs not in (self.robot.action.size, 2 * self.robot.action.size):
             raise ValueError(f"its network has {outputs} outputs")
-        return MLP((*self.hidden, outputs), ACTIVATIONS[self.activation])
+        return MLP((*self.policy_hidden_layer_sizes, outputs), ACTIVATIONS[self.activation])
 
     def fresh(self, key: jax.Array) -> dict[str, Any]:
         """Parameters and statistics of the shapes that these have, untrained."""
-        size = self.robot.observation.size + 3 * self.directed
+        size = self.robot.observation.size + 3 * self.goal_conditioned
         params = self._network().init(key, jnp.zeros(size, jnp.float32))
         return {
             "params": params,
@@ -106,9 +108,9 @@ class Policy(flax.struct.PyTreeNode):
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
         )
         meta = described(self.robot) | {
-            "hidden": self.hidden,
+            "policy_hidden_layer_sizes": self.policy_hidden_layer_sizes,
             "activation": self.activation,
-            "directed": self.directed,
+            "goal_conditioned": self.goal_conditioned,
         }
         files.save_arrays(path, leaves, meta, overwrite)
 
@@ -120,14 +122,14 @@ class Policy(flax.struct.PyTreeNode):
           BadInput: what it says of its network cannot be.
         """
         for name, allowed in (
-            ("hidden", layers), ("activation", one_of(ACTIVATIONS)),
-            ("directed", one_of((False, True))),
+            ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),
+            ("goal_conditioned", one_of((False, True))),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         return cls(
             **tree,
-            hidden=tuple(meta["hidden"]),
+            policy_hidden_layer_sizes=tuple(meta["policy_hidden_layer_sizes"]),
             activation=meta["activation"],
-            directed=meta["directed"],
+            goal_conditioned=meta["goal_conditioned"],
             robot=robot,
         )

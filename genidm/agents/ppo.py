@@ -2,10 +2,10 @@
 
 An iteration is two programs. In the first every device steps its own lanes; in the second
 the running statistics take the new inputs in, and the networks learn from the batch in
-`epochs` passes, on one device: networks this small learn faster than their gradients could
-be averaged (four CPU devices: 0.3 s an iteration instead of 0.6), what is learned does not
-depend on the number of devices, and no program waits for another device, which XLA's
-collectives on a CPU can do forever when cores are scarce.
+`num_updates_per_batch` passes, on one device: networks this small learn faster than their gradients
+could be averaged (four CPU devices: 0.3 s an iteration instead of 0.6), what is learned does not
+depend on the number of devices, and no program waits for another device, which XLA's collectives on
+a CPU can do forever when cores are scarce.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo.losses import PPONetworkParams, compute_ppo_loss
 from brax.training.gradients import gradient_update_fn
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 from flax import linen
 from jax.sharding import Mesh
 
-from genidm.agents.alternating import Alternates, Alternating, Learner
 from genidm.agents.base import Metrics
 from genidm.agents.policy import Activation, no_statistics, normalize
-from genidm.agents.walking import walk
+from genidm.agents.rollout_then_learn import AgentState, Alternates, RolloutThenLearn
+from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Step, Task, input_size, inputs, outlook
+from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size, inputs
 
 # Of what Brax's loss reports, what is worth a curve.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
@@ -50,7 +50,7 @@ class TrainingState(flax.struct.PyTreeNode):
     key: jax.Array
 
     @property
-    def chosen(self) -> tuple[RunningStatisticsState, Any]:
+    def actor_params(self) -> tuple[RunningStatisticsState, Any]:
         """What chooses actions."""
         return self.statistics, self.params.policy
 
@@ -60,46 +60,59 @@ class PPO(Alternates):
     """Settings of PPO.
 
     Attributes:
-      lanes: robots at once.
-      unroll: steps an iteration; lanes × unroll transitions are learned from at a time.
-      epochs: passes over each batch.
-      minibatches: parts of the batch, each of lanes / minibatches lanes.
+      num_envs: robots at once.
+      unroll_length: steps an iteration; num_envs × unroll_length transitions are learned from at a
+        time.
+      num_updates_per_batch: passes over each batch.
+      num_minibatches: parts of the batch, each of num_envs / num_minibatches lanes.
       learning_rate: of Adam.
-      discount: of rewards, a step.
-      gae: λ of generalised advantage estimation.
-      clip: of the policy's ratio.
-      entropy: weight of the entropy bonus.
-      reward_scale: rewards are multiplied by it before the value function sees them.
-      hidden: layers of the policy (Table 2: 64×64).
-      value_hidden: layers of the value function.
-      max_gradient: gradients are clipped to this norm.
+      discounting: of rewards, a step.
+      gae_lambda: λ of generalised advantage estimation.
+      clipping_epsilon: of the policy's ratio.
+      entropy_cost: weight of the entropy bonus.
+      reward_scaling: rewards are multiplied by it before the value function sees them.
+      policy_hidden_layer_sizes: layers of the policy (Table 2: 64×64).
+      value_hidden_layer_sizes: layers of the value function.
+      max_grad_norm: gradients are clipped to this norm.
     """
 
     activation: ClassVar[Activation] = "tanh"
 
-    lanes: int = 128
-    unroll: int = 16
-    epochs: int = 4
-    minibatches: int = 4
+    num_envs: int = 128
+    unroll_length: int = 16
+    num_updates_per_batch: int = 4
+    num_minibatches: int = 4
     learning_rate: float = 5e-4
-    discount: float = 0.99
-    gae: float = 0.95
-    clip: float = 0.2
-    entropy: float = 1e-3
-    reward_scale: float = 0.1
-    hidden: tuple[int, ...] = (64, 64)
-    value_hidden: tuple[int, ...] = (64, 64)
-    max_gradient: float = 1.0
+    discounting: float = 0.99
+    gae_lambda: float = 0.95
+    clipping_epsilon: float = 0.2
+    entropy_cost: float = 1e-3
+    reward_scaling: float = 0.1
+    policy_hidden_layer_sizes: tuple[int, ...] = (64, 64)
+    value_hidden_layer_sizes: tuple[int, ...] = (64, 64)
+    max_grad_norm: float = 1.0
 
     def __post_init__(self) -> None:
         check(
-            self, lanes=count(), unroll=count(), epochs=count(), minibatches=count(),
-            learning_rate=positive(), discount=number(0, 1, above=True, below=True),
-            gae=number(0, 1), clip=positive(), entropy=number(0), reward_scale=positive(),
-            hidden=layers, value_hidden=layers, max_gradient=positive(),
-        )  # fmt: skip
-        if self.lanes % self.minibatches:
-            uneven = f"{self.lanes} lanes cannot be shared among {self.minibatches} minibatches"
+            self,
+            num_envs=count(),
+            unroll_length=count(),
+            num_updates_per_batch=count(),
+            num_minibatches=count(),
+            learning_rate=positive(),
+            discounting=number(0, 1, above=True, below=True),
+            gae_lambda=number(0, 1),
+            clipping_epsilon=positive(),
+            entropy_cost=number(0),
+            reward_scaling=positive(),
+            policy_hidden_layer_sizes=layers,
+            value_hidden_layer_sizes=layers,
+            max_grad_norm=positive(),
+        )
+        if self.num_envs % self.num_minibatches:
+            uneven = (
+                f"{self.num_envs} lanes cannot be shared among {self.num_minibatches} minibatches"
+            )
             raise BadInput(f"{uneven} evenly")
 
     def networks(self, robot: Robot, task: Task) -> ppo_networks.PPONetworks:
@@ -108,28 +121,30 @@ class PPO(Alternates):
             input_size(robot, task),
             robot.action.size,
             preprocess_observations_fn=normalize,
-            policy_hidden_layer_sizes=self.hidden,
-            value_hidden_layer_sizes=self.value_hidden,
+            policy_hidden_layer_sizes=self.policy_hidden_layer_sizes,
+            value_hidden_layer_sizes=self.value_hidden_layer_sizes,
             activation=linen.tanh,
         )
 
-    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> Alternating:
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
         """The two programs of an iteration."""
         networks = self.networks(robot, task)
         optimizer = optax.chain(
-            optax.clip_by_global_norm(self.max_gradient), optax.adam(self.learning_rate)
+            optax.clip_by_global_norm(self.max_grad_norm), optax.adam(self.learning_rate)
         )
-        walk = functools.partial(_walk, robot, task, networks, self.unroll, self.discount)
+        rollout = functools.partial(
+            _rollout, robot, task, networks, self.unroll_length, self.discounting
+        )
         learn = functools.partial(self._learn, networks, optimizer)
 
-        def start(key: jax.Array) -> Learner:
+        def start(key: jax.Array) -> AgentState:
             lanes, policy, value, stream = jax.random.split(key, 4)
             params = PPONetworkParams(
                 networks.policy_network.init(policy), networks.value_network.init(value)
             )
-            return Learner(
-                lanes=task.start(robot, jax.random.split(lanes, self.lanes)),
-                training=TrainingState(
+            return AgentState(
+                env_state=task.start(robot, jax.random.split(lanes, self.num_envs)),
+                training_state=TrainingState(
                     params=params,
                     optimizer=optimizer.init(params),
                     statistics=no_statistics(input_size(robot, task)),
@@ -137,26 +152,26 @@ class PPO(Alternates):
                 ),
             )
 
-        return Alternating("PPO", start, walk, learn, mesh)
+        return RolloutThenLearn("PPO", start, rollout, learn, mesh)
 
     def _learn(
         self,
         networks: ppo_networks.PPONetworks,
         optimizer: optax.GradientTransformation,
         training: TrainingState,
-        batch: Transition,
+        batch: BraxTransition,
     ) -> tuple[TrainingState, Metrics]:
-        """`epochs` passes over a batch `[unroll, lanes, ...]`, in shuffled minibatches."""
+        """Learns from a batch `[unroll_length, lanes, ...]`, in shuffled minibatches."""
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
         statistics = running_statistics.update(training.statistics, batch.observation)
         loss = functools.partial(
             compute_ppo_loss,
             ppo_network=networks,
-            entropy_cost=self.entropy,
-            discounting=self.discount,
-            reward_scaling=self.reward_scale,
-            gae_lambda=self.gae,
-            clipping_epsilon=self.clip,
+            entropy_cost=self.entropy_cost,
+            discounting=self.discounting,
+            reward_scaling=self.reward_scaling,
+            gae_lambda=self.gae_lambda,
+            clipping_epsilon=self.clipping_epsilon,
         )
         update = gradient_update_fn(loss, optimizer, pmap_axis_name=None, has_aux=True)
 
@@ -168,29 +183,33 @@ class PPO(Alternates):
 
         def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
             order, noise = jax.random.split(key)
-            parts = _shuffled(batch, jax.random.permutation(order, self.lanes), self.minibatches)
+            parts = _shuffled(
+                batch, jax.random.permutation(order, self.num_envs), self.num_minibatches
+            )
             return jax.lax.scan(
-                minibatch, carry, (parts, jax.random.split(noise, self.minibatches))
+                minibatch, carry, (parts, jax.random.split(noise, self.num_minibatches))
             )
 
         key, stream = jax.random.split(training.key)
         (params, state), info = jax.lax.scan(
-            epoch, (training.params, training.optimizer), jax.random.split(stream, self.epochs)
+            epoch,
+            (training.params, training.optimizer),
+            jax.random.split(stream, self.num_updates_per_batch),
         )
         return TrainingState(params, state, statistics, key), {n: info[n].mean() for n in LOSSES}
 
 
-def _walk(
+def _rollout(
     robot: Robot,
     task: Task,
     networks: ppo_networks.PPONetworks,
-    unroll: int,
-    discount: float,
+    unroll_length: int,
+    discounting: float,
     statistics: RunningStatisticsState,
     policy: Any,
-    lanes: Lanes,
-) -> tuple[Lanes, Experience, Transition, Metrics]:
-    """`unroll` steps of every lane under the policy's own noise; outputs `[unroll, B, ...]`."""
+    lanes: EnvState,
+) -> tuple[EnvState, Experience, BraxTransition, Metrics]:
+    """Steps every lane under the policy's own noise; outputs `[unroll_length, B, ...]`."""
     distribution = networks.parametric_action_distribution
 
     def draw(key: jax.Array) -> jax.Array:
@@ -202,35 +221,39 @@ def _walk(
         raw = normal.loc + normal.scale * noise
         return distribution.postprocess(raw), (logits, raw)
 
-    def keep(step: Step, notes: Any) -> dict[str, Any]:
+    def keep(step: Transition, notes: Any) -> dict[str, Any]:
         logits, raw = notes
         return {
             "goal": step.goal,
-            "reward": outlook(step, discount),
+            "reward": bootstrapped_reward(step, discounting),
             "discount": 1.0 - step.terminal,
             "truncation": 1.0 * (step.last & ~step.terminal),
             "distribution_params": logits,
             "raw_action": raw,
         }
 
-    lanes, experience, kept, seen = walk(robot, task, unroll, draw, choose, keep, lanes)
+    lanes, experience, kept, seen = generate_unroll(
+        robot, task, unroll_length, draw, choose, keep, lanes
+    )
     kept["log_prob"] = distribution.log_prob(kept["distribution_params"], kept["raw_action"])
-    return lanes, experience, transition(experience, kept, lanes), seen
+    return lanes, experience, brax_transition(experience, kept, lanes), seen
 
 
-def transition(experience: Experience, kept: dict[str, Any], lanes: Lanes) -> Transition:
+def brax_transition(
+    experience: Experience, kept: dict[str, Any], lanes: EnvState
+) -> BraxTransition:
     """What Brax's loss reads of steps `[T, B]`.
 
     Args:
       experience: the steps.
       kept: what PPO has kept of them.
-      lanes: Lanes `[B]` after the last step. The loss asks for the value of its state alone, and
+      lanes: EnvState `[B]` after the last step. The loss asks for the value of its state alone, and
         not at all where the last step has ended an episode.
     """
     goal = kept["goal"]
-    after = inputs(lanes.robots.observation, lanes.displacement)
+    after = inputs(lanes.robots.observation, lanes.relative_goal)
     choice = ("distribution_params", "raw_action", "log_prob")
-    return Transition(
+    return BraxTransition(
         observation=inputs(experience.s, None if goal is None else goal - experience.o),
         action=experience.a,
         reward=kept["reward"],

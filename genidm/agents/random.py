@@ -5,25 +5,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from genidm import devices
 from genidm.agents.base import Iterate, Learning, Metrics
-from genidm.agents.walking import walk
+from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count
 from genidm.experience import Experience
-from genidm.progress import compiled
+from genidm.progress import compile_ahead
 from genidm.robots.base import Robot
-from genidm.tasks import Lanes, Step, Task
-
-
-class Learner(flax.struct.PyTreeNode):
-    """Lanes, and nothing that learns."""
-
-    lanes: Lanes
+from genidm.tasks import EnvState, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,17 +24,17 @@ class RandomActions:
     """Uniform actions in [−1, 1].
 
     Attributes:
-      lanes: robots at once.
-      unroll: steps an iteration.
+      num_envs: robots at once.
+      unroll_length: steps an iteration.
     """
 
-    lanes: int = 128
-    unroll: int = 32
+    num_envs: int = 128
+    unroll_length: int = 32
 
     def __post_init__(self) -> None:
-        check(self, lanes=count(), unroll=count())
+        check(self, num_envs=count(), unroll_length=count())
 
-    def policy(self, robot: Robot, task: Task, learner: Learner) -> None:
+    def policy(self, robot: Robot, task: Task, learner: EnvState) -> None:
         """There is none: nothing is learned."""
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
@@ -51,23 +44,25 @@ class RandomActions:
         def choose(_: jax.Array, drawn: jax.Array) -> tuple[jax.Array, None]:
             return drawn, None
 
-        def keep(step: Step, notes: None) -> None:
+        def keep(step: Transition, notes: None) -> None:
             """Nothing: nothing is learned."""
 
-        stepping = functools.partial(walk, robot, task, self.unroll, draw, choose, keep)
+        stepping = functools.partial(
+            generate_unroll, robot, task, self.unroll_length, draw, choose, keep
+        )
 
-        def start(key: jax.Array) -> Learner:
-            return Learner(task.start(robot, jax.random.split(key, self.lanes)))
+        def start(key: jax.Array) -> EnvState:
+            return task.start(robot, jax.random.split(key, self.num_envs))
 
-        def prepare(learner: Learner) -> Iterate:
+        def prepare(lanes: EnvState) -> Iterate:
             sharded = devices.over_lanes(stepping, mesh, [0], (0, 1, 1, 1))
             jitted = jax.jit(sharded, donate_argnums=0)
-            program = compiled("random stepping", jitted, learner.lanes)
+            program = compile_ahead("random stepping", jitted, lanes)
 
-            def iterate(learner: Learner) -> tuple[Learner, Experience, Metrics]:
-                lanes, experience, _, seen = program(learner.lanes)
-                return Learner(lanes), experience, seen
+            def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
+                lanes, experience, _, seen = program(lanes)
+                return lanes, experience, seen
 
             return iterate
 
-        return Learning(start, lambda learner: devices.put(learner, mesh), prepare)
+        return Learning(start, lambda lanes: devices.put(lanes, mesh), prepare)

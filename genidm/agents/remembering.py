@@ -32,9 +32,9 @@ class Remembering:
         self.checkpoints.save(step, emptied(tree), self._parts)
 
     def _append(self, buffer: Buffer) -> None:
-        written, capacity = int(buffer.written), buffer.rows.last.shape[0]
-        since = max(written - capacity, _span(self._parts[-1])[1] if self._parts else 0)
-        self._parts = [part for part in self._parts if _span(part)[1] > written - capacity]
+        written, max_replay_size = int(buffer.written), buffer.rows.last.shape[0]
+        since = max(written - max_replay_size, _span(self._parts[-1])[1] if self._parts else 0)
+        self._parts = [part for part in self._parts if _span(part)[1] > written - max_replay_size]
         if since < written:
             rows = newest(buffer, written - since)
             name = f"{since:010d}_{written:010d}"

@@ -15,7 +15,7 @@ from brax.training.agents.sac.networks import SACNetworks
 from brax.training.distribution import NormalTanhDistribution
 from brax.training.gradients import gradient_update_fn
 from brax.training.networks import make_policy_network, make_q_network
-from brax.training.types import Transition
+from brax.training.types import Transition as BraxTransition
 
 from genidm.agents.base import Metrics
 from genidm.agents.off_policy import Algorithm, OffPolicy
@@ -23,7 +23,7 @@ from genidm.agents.policy import normalize
 from genidm.robots.base import Robot
 
 
-class Networks(flax.struct.PyTreeNode):
+class SACState(flax.struct.PyTreeNode):
     """Parameters of policy, critics, their targets and the temperature, and the optimizers."""
 
     policy: Any
@@ -49,9 +49,15 @@ class SAC(OffPolicy):
         """Brax's policy and two critics on normalised inputs."""
         distribution = NormalTanhDistribution(event_size=robot.action.size)
         return SACNetworks(
-            make_policy_network(distribution.param_size, size, normalize, self.hidden),
+            make_policy_network(
+                distribution.param_size, size, normalize, self.policy_hidden_layer_sizes
+            ),
             make_q_network(
-                size, robot.action.size, normalize, self.critic_hidden, layer_norm=self.layer_norm
+                size,
+                robot.action.size,
+                normalize,
+                self.critic_hidden_layer_sizes,
+                layer_norm=self.layer_norm,
             ),
             distribution,
         )
@@ -59,12 +65,12 @@ class SAC(OffPolicy):
     def algorithm(self, robot: Robot, size: int) -> Algorithm:
         networks = self.networks(robot, size)
         adam = optax.adam(self.learning_rate)
-        losses = make_losses(networks, self.reward_scale, self.discount, robot.action.size)
+        losses = make_losses(networks, self.reward_scaling, self.discounting, robot.action.size)
         alpha_update, critic_update, policy_update = (
             gradient_update_fn(loss, adam, pmap_axis_name=None) for loss in losses
         )
 
-        def start(key: jax.Array) -> Networks:
+        def start(key: jax.Array) -> SACState:
             policy_key, critic_key = jax.random.split(key)
             policy = networks.policy_network.init(policy_key)
             critic = networks.q_network.init(critic_key)
@@ -72,7 +78,7 @@ class SAC(OffPolicy):
             # The target is a copy: one buffer cannot be donated twice.
             target = jax.tree.map(jnp.copy, critic)
             states = (adam.init(x) for x in (policy, critic, log_alpha))
-            return Networks(policy, critic, target, log_alpha, *states)
+            return SACState(policy, critic, target, log_alpha, *states)
 
         def draw(key: jax.Array) -> jax.Array:
             return jax.random.normal(key, (robot.action.size,), jnp.float32)
@@ -86,8 +92,8 @@ class SAC(OffPolicy):
             return distribution.postprocess(normal.loc + normal.scale * noise)
 
         def update(
-            n: Networks, statistics: RunningStatisticsState, batch: Transition, key: jax.Array
-        ) -> tuple[Networks, Metrics]:
+            n: SACState, statistics: RunningStatisticsState, batch: BraxTransition, key: jax.Array
+        ) -> tuple[SACState, Metrics]:
             keys = jax.random.split(key, 3)
             alpha = jnp.exp(n.log_alpha)
             _, log_alpha, alpha_state = alpha_update(
@@ -104,7 +110,7 @@ class SAC(OffPolicy):
             )  # fmt: skip
             target = optax.incremental_update(critic, n.target, self.tau)
             info = {"critic_loss": critic_loss, "policy_loss": policy_loss, "alpha": alpha}
-            new = Networks(
+            new = SACState(
                 policy, critic, target, log_alpha, policy_state, critic_state, alpha_state
             )
             return new, info

@@ -93,6 +93,6 @@ class Engine(abc.ABC):
         """The devices that share the lanes."""
         return devices.mesh(jax.devices()[:1]) if self.one_device else devices.mesh()
 
-    def at_once(self, lanes: int) -> int:
+    def max_parallel_envs(self, lanes: int) -> int:
         """Largest batch to step together for a caller that asks for `lanes`."""
         return lanes

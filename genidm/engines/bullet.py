@@ -40,7 +40,7 @@ class Bullet(Engine):
         count = self.pool.workers
         return f"PyBullet in {count} process{'es' if count > 1 else ''}"
 
-    def at_once(self, lanes: int) -> int:
+    def max_parallel_envs(self, lanes: int) -> int:
         """No more than keep the processes busy: a lane whose episode is over costs a step, too."""
         return min(lanes, KEEP_BUSY * self.pool.workers)
 

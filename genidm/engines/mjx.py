@@ -35,9 +35,9 @@ class MJX(Engine):
         kind, count = jax.devices()[0].device_kind, jax.device_count()
         return f"MJX on {count} jax device{'s' if count > 1 else ''} ({kind})"
 
-    def at_once(self, lanes: int) -> int:
+    def max_parallel_envs(self, lanes: int) -> int:
         """On an accelerator more than was asked for, because small batches leave it idle."""
-        return devices.at_once(lanes)
+        return devices.max_parallel_envs(lanes)
 
     def step(self, physics: Physics, action: jax.Array) -> Stepped:
         return jax.vmap(self._step)(physics, action)

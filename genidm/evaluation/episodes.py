@@ -14,7 +14,7 @@ class Episodes:
     Attributes:
       closest: metres; least horizontal distance to the target, the paper's measure.
       start: metres; horizontal distance at the start.
-      reached: bool; came within the reach radius.
+      reached: bool; came within the goal radius.
       fell: bool; ended by a fall.
       diverged: bool; ended because the physics left the finite numbers.
       steps: int; control steps made.

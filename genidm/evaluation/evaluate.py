@@ -1,4 +1,4 @@
-"""The paper's test (A.1.3): closest distance to the target, over a bank of scenarios."""
+"""The paper's test (A.1.3): closest distance to the target, over scenarios."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from jax.sharding import Mesh
 from genidm import checks, devices
 from genidm.checks import check_value, count
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluator import Evaluator, Outcome, Steering, Test, Watch, position
+from genidm.evaluation.evaluator import (
+    ControllerFn,
+    EpisodeResults,
+    EvaluationSettings,
+    Evaluator,
+    Record,
+    position,
+)
 from genidm.evaluation.scenarios import MOST_EPISODES, Scenarios
 from genidm.progress import Progress
 from genidm.robots.base import Robot
@@ -22,9 +29,9 @@ from genidm.store import Stage
 
 def evaluate(
     robot: Robot,
-    controller: Steering,
-    bank: Scenarios,
-    settings: Test | None = None,
+    controller: ControllerFn,
+    scenarios: Scenarios,
+    settings: EvaluationSettings | None = None,
     *,
     mesh: Mesh | None = None,
     stage: Stage | None = None,
@@ -37,29 +44,34 @@ def evaluate(
     Args:
       robot: what is steered.
       controller: what steers it.
-      bank: scenarios `[seeds, episodes]`.
-      settings: length of an episode, reach radius, lanes.
+      scenarios: scenarios `[seeds, episodes]`.
+      settings: length of an episode, goal radius, lanes.
       mesh: devices to share the lanes among; as the robot's engine wants, unless given.
       stage: where checkpoints and metrics go; nowhere, unless given.
       quiet: no progress bar.
     """
-    outcome, _ = run(
-        robot, controller, flatten(bank), settings, mesh=mesh, stage=stage, quiet=quiet
+    results, _ = run(
+        robot, controller, flatten(scenarios), settings, mesh=mesh, stage=stage, quiet=quiet
     )
-    return episodes(outcome, bank.shape)
+    return episodes(results, scenarios.shape)
 
 
 def trace(
-    robot: Robot, controller: Steering, bank: Scenarios, settings: Test | None = None
+    robot: Robot,
+    controller: ControllerFn,
+    scenarios: Scenarios,
+    settings: EvaluationSettings | None = None,
 ) -> tuple[Episodes, list[np.ndarray]]:
-    """`evaluate`, and the way of every episode: positions `[steps + 1, 3]`, in the bank's order."""
-    outcome, ways = run(
-        robot, controller, flatten(bank), settings, traced=bank.yaw.size, quiet=True
+    """`evaluate`, and the trajectory `[steps + 1, 3]` of every episode, in the scenarios' order."""
+    results, trajectories = run(
+        robot, controller, flatten(scenarios), settings, traced=scenarios.yaw.size, quiet=True
     )
-    return episodes(outcome, bank.shape), ways
+    return episodes(results, scenarios.shape), trajectories
 
 
-def walking_speed(robot: Robot, policy: Steering, episodes: int = 100, seed: int = 0) -> np.ndarray:
+def walking_speed(
+    robot: Robot, policy: ControllerFn, episodes: int = 100, seed: int = 0
+) -> np.ndarray:
     """Speed towards +x of a policy that learned to walk there, `[episodes]`, m/s.
 
     Each episode starts as in training and ends with a fall, or after 1000 steps.
@@ -72,33 +84,33 @@ def walking_speed(robot: Robot, policy: Steering, episodes: int = 100, seed: int
     keys = jax.random.split(jax.random.key(seed), (1, episodes))
     # A target that is out of reach: what is gained on it is the way walked.
     target = jnp.broadcast_to(jnp.asarray([1e4, 0.0, 0.0], jnp.float32), (1, episodes, 3))
-    outcome = evaluate(
+    results = evaluate(
         robot, policy, Scenarios(keys, jnp.zeros((1, episodes), jnp.float32), target)
     )
-    return (outcome.start - outcome.closest)[0] / (outcome.steps[0] * robot.control_step)
+    return (results.start - results.closest)[0] / (results.steps[0] * robot.dt)
 
 
 def run(
     robot: Robot,
-    controller: Steering,
-    bank: Scenarios,
-    settings: Test | None = None,
+    controller: ControllerFn,
+    scenarios: Scenarios,
+    settings: EvaluationSettings | None = None,
     *,
     traced: int = 0,
-    watch: Watch = position,
+    record: Record = position,
     mesh: Mesh | None = None,
     stage: Stage | None = None,
     quiet: bool = False,
-) -> tuple[Outcome, list[Any]]:
+) -> tuple[EpisodeResults, list[Any]]:
     """`evaluate` on scenarios `[N]`, the first of them traced.
 
     Args:
       robot: what is steered.
       controller: what steers it.
-      bank: scenarios `[N]` (`flatten`).
-      settings: length of an episode, reach radius, lanes.
+      scenarios: scenarios `[N]` (`flatten`).
+      settings: length of an episode, goal radius, lanes.
       traced: how many of the first episodes to give the traces of.
-      watch: what a trace keeps of each state; the position, unless given.
+      record: what a trace keeps of each state; the position, unless given.
       mesh: devices to share the lanes among; as the robot's engine wants, unless given.
       stage: where checkpoints and metrics go; nowhere, unless given.
       quiet: no progress bar.
@@ -106,7 +118,9 @@ def run(
     Returns:
       outcomes `[N]`, and for each traced episode a tree `[steps + 1, ...]` of what was kept.
     """
-    evaluator = Evaluator(robot, bank, settings or Test(), mesh or robot.mesh(), traced, watch)
+    evaluator = Evaluator(
+        robot, scenarios, settings or EvaluationSettings(), mesh or robot.mesh(), traced, record
+    )
     queue, calls = evaluator.start(), 0
     # Its queues belong to the devices: on others the test begins anew.
     here = f"{evaluator.mesh.size}_devices_{queue.running.episode.size}_lanes"
@@ -125,19 +139,19 @@ def run(
             bar.advance(done - before, useful=useful, longest=longest)
             if checkpoints and checkpoints.due():
                 checkpoints.save(calls, queue)
-    return evaluator.outcome(queue), evaluator.traces(queue)
+    return evaluator.results(queue), evaluator.traces(queue)
 
 
-def flatten(*banks: Scenarios) -> Scenarios:
-    """Banks `[seeds, episodes]` one after another, as scenarios `[N]`."""
+def flatten(*scenarios: Scenarios) -> Scenarios:
+    """Scenarios `[seeds, episodes]` one after another, as scenarios `[N]`."""
 
     def join(*parts: Any) -> Any:
         return jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in parts])
 
-    return jax.tree.map(join, *banks)
+    return jax.tree.map(join, *scenarios)
 
 
-def episodes(outcome: Outcome, shape: tuple[int, int]) -> Episodes:
+def episodes(results: EpisodeResults, shape: tuple[int, int]) -> Episodes:
     """Outcomes `[seeds × episodes]` as Episodes `[seeds, episodes]`."""
-    names = [f.name for f in dataclasses.fields(Outcome)]
-    return Episodes(**{name: np.asarray(getattr(outcome, name)).reshape(shape) for name in names})
+    names = [f.name for f in dataclasses.fields(EpisodeResults)]
+    return Episodes(**{name: np.asarray(getattr(results, name)).reshape(shape) for name in names})

@@ -21,10 +21,10 @@ from genidm import devices
 from genidm.checks import check, count, number
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
-from genidm.progress import compiled
+from genidm.progress import compile_ahead
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
-from genidm.symmetry import horizontal
+from genidm.symmetry import horizontal_norm
 
 # Steps of an episode, which a trace holds, and of a program call, which holds what each leaves.
 MOST_STEPS = 10**5
@@ -32,9 +32,9 @@ MOST_AT_ONCE = 10**4
 
 # (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled
 # program serves every controller of the same shape.
-Steering = Callable[[jax.Array, jax.Array], jax.Array]
+ControllerFn = Callable[[jax.Array, jax.Array], jax.Array]
 # State [B] → a tree of arrays [B, ...]: what is kept of each state of a traced episode.
-Watch = Callable[[State], Any]
+Record = Callable[[State], Any]
 
 
 # What jax raises where a function of the user's looks at numbers that are not there yet.
@@ -74,7 +74,7 @@ def ask(who: str, asked: Callable[..., Any], shape: tuple[int, ...], *args: Any)
     return jnp.asarray(answer)
 
 
-def as_tree(controller: Steering) -> Any:
+def as_tree(controller: ControllerFn) -> Any:
     """A controller as a program takes it: a tree of arrays as it is, other functions as constants.
 
     One compiled program serves every controller that is a tree, of the same shape.
@@ -83,7 +83,7 @@ def as_tree(controller: Steering) -> Any:
     return jax.tree_util.Partial(controller) if alone else controller
 
 
-def steered(robot: Robot, controller: Steering, robots: State, target: jax.Array) -> jax.Array:
+def steered(robot: Robot, controller: ControllerFn, robots: State, target: jax.Array) -> jax.Array:
     """Actions `[B, A]` for robots `[B]` on their way to `target [B, 3]`, metres.
 
     Raises:
@@ -99,29 +99,27 @@ def position(state: State) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Test:
+class EvaluationSettings:
     """Settings of the test.
 
     Attributes:
       max_steps: an episode ends after this many steps (A.1.3: 1000).
-      reach: metres; an episode ends when the target is this near.
-      lanes: robots at once, over all devices; see `Robot.at_once`.
+      goal_radius: metres; an episode ends when the target is this near.
+      num_envs: robots at once, over all devices; see `Robot.max_parallel_envs`.
       chunk: steps a program call.
     """
 
-    __test__ = False  # not a test case for pytest
-
     max_steps: int = 1000
-    reach: float = 0.1
-    lanes: int = 512
+    goal_radius: float = 0.1
+    num_envs: int = 512
     chunk: int = 50
 
     def __post_init__(self) -> None:
         steps, chunk = count(1, MOST_STEPS), count(1, MOST_AT_ONCE)
-        check(self, max_steps=steps, lanes=count(), chunk=chunk, reach=number(0))
+        check(self, max_steps=steps, num_envs=count(), chunk=chunk, goal_radius=number(0))
 
 
-class Outcome(flax.struct.PyTreeNode):
+class EpisodeResults(flax.struct.PyTreeNode):
     """What is known of each episode `[N]`, ended or not; see `Episodes`."""
 
     closest: jax.Array
@@ -140,28 +138,28 @@ class Running(flax.struct.PyTreeNode):
       robots: State `[L]`.
       target: `[L, 3]`.
       episode: `[L]` int32, which of the device's n episodes the lane is at; n when it has none.
-      now: Outcome `[L]` of the running episodes.
+      now: EpisodeResults `[L]` of the running episodes.
       taken: `[1]` int32, episodes handed out.
     """
 
     robots: State
     target: jax.Array
     episode: jax.Array
-    now: Outcome
+    now: EpisodeResults
     taken: jax.Array
 
 
-class Queue(flax.struct.PyTreeNode):
+class EvaluationState(flax.struct.PyTreeNode):
     """One device's share of the test: its lanes, and the results of its n episodes.
 
     Attributes:
       running: the lanes.
-      ended: Outcome `[n]` of the episodes that have ended.
+      ended: EpisodeResults `[n]` of the episodes that have ended.
       traces: tree `[m, max_steps + 1, ...]`, what is kept of the first m episodes.
     """
 
     running: Running
-    ended: Outcome
+    ended: EpisodeResults
     traces: Any
 
 
@@ -179,40 +177,40 @@ class Share(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """A test at work: a bank of scenarios shared out over the devices.
+    """A test at work: scenarios shared out over the devices.
 
     Attributes:
       robot: what is steered.
-      bank: scenarios `[N]`.
+      scenarios: scenarios `[N]`.
       settings: of the test.
       mesh: devices that the lanes and scenarios are shared among.
       traced: how many of the first episodes leave a trace in the queue.
-      watch: what a trace keeps of each state.
+      record: what a trace keeps of each state.
     """
 
-    __test__ = False  # not a test case for pytest
-
     robot: Robot
-    bank: Scenarios
-    settings: Test
+    scenarios: Scenarios
+    settings: EvaluationSettings
     mesh: Mesh
     traced: int = 0
-    watch: Watch = position
+    record: Record = position
 
     @property
     def total(self) -> int:
-        """Episodes in the bank, N."""
-        return self.bank.yaw.shape[0]
+        """Scenarios in all, N."""
+        return self.scenarios.yaw.shape[0]
 
     @property
     def share(self) -> int:
-        """Scenarios of a device, n; the bank is filled up to n a device."""
+        """Scenarios of a device, n; the last of them is repeated to fill them up to n a device."""
         return -(-self.total // self.mesh.size)
 
-    def start(self) -> Queue:
+    def start(self) -> EvaluationState:
         """Queues whose lanes are all idle, on the devices."""
         count, share = self.mesh.size, self.share
-        lanes = count * min(-(-self.robot.at_once(self.settings.lanes) // count), share)
+        lanes = count * min(
+            -(-self.robot.max_parallel_envs(self.settings.num_envs) // count), share
+        )
         running = Running(
             robots=jax.tree.map(
                 lambda x: jnp.zeros((lanes, *x.shape[1:]), x.dtype), self._shares.robots
@@ -222,7 +220,7 @@ class Evaluator:
             now=_nothing(lanes),
             taken=jnp.zeros(count, jnp.int32),
         )
-        queue = Queue(running, _nothing(share * count), self._no_traces())
+        queue = EvaluationState(running, _nothing(share * count), self._no_traces())
         return devices.put(queue, self.mesh)
 
     def _no_traces(self) -> Any:
@@ -236,40 +234,42 @@ class Evaluator:
             trace = jnp.zeros((len(starts), steps + 1, *x.shape[1:]), x.dtype)
             return trace.at[:, 0].set(starts)
 
-        return jax.tree.map(first, self.watch(jax.tree.map(np.asarray, self._shares.robots)))
+        return jax.tree.map(first, self.record(jax.tree.map(np.asarray, self._shares.robots)))
 
-    def prepare(self, controller: Steering, queue: Queue) -> Callable[[Queue], Queue]:
+    def prepare(
+        self, controller: ControllerFn, queue: EvaluationState
+    ) -> Callable[[EvaluationState], EvaluationState]:
         """The compiled program of `settings.chunk` steps of every lane; it donates the queue."""
         controller = devices.put(as_tree(controller), self.mesh, None)
         shares = self._shares
-        body = functools.partial(_chunk, self.robot, self.settings, self.watch)
+        body = functools.partial(_chunk, self.robot, self.settings, self.record)
         sharded = devices.over_lanes(body, self.mesh, [None, 0, 0], 0)
         jitted = jax.jit(sharded, donate_argnums=1)
-        program = compiled("evaluation", jitted, controller, queue, shares)
+        program = compile_ahead("evaluation", jitted, controller, queue, shares)
         return lambda queue: program(controller, queue, shares)
 
-    def ended(self, queue: Queue) -> int:
+    def ended(self, queue: EvaluationState) -> int:
         """Episodes that have ended, those that fill up a share not counted."""
         return int((self._in_order(queue.ended.steps)[: self.total] > 0).sum())
 
-    def useful(self, queue: Queue, calls: int) -> float:
+    def useful(self, queue: EvaluationState, calls: int) -> float:
         """Share of the lane-steps of so many calls that were spent in episodes."""
         steps = np.asarray(queue.ended.steps).sum() + self._under_way(queue).sum()
         return float(steps / (calls * self.settings.chunk * queue.running.episode.shape[0]))
 
-    def longest(self, queue: Queue) -> int:
+    def longest(self, queue: EvaluationState) -> int:
         """Steps of the longest episode under way; until it ends there may be none to count."""
         return int(self._under_way(queue).max())
 
-    def _under_way(self, queue: Queue) -> np.ndarray:
+    def _under_way(self, queue: EvaluationState) -> np.ndarray:
         """Steps `[lanes]` of the episode that each lane is at; 0 for one that has none."""
         return np.where(np.asarray(queue.running.episode) < self.share, queue.running.now.steps, 0)
 
-    def outcome(self, queue: Queue) -> Outcome:
-        """Outcomes `[N]`, in the order of the bank."""
+    def results(self, queue: EvaluationState) -> EpisodeResults:
+        """Outcomes `[N]`, in the order of the scenarios."""
         return jax.tree.map(lambda x: self._in_order(x)[: self.total], queue.ended)
 
-    def traces(self, queue: Queue) -> list[Any]:
+    def traces(self, queue: EvaluationState) -> list[Any]:
         """What was kept of each traced episode, tree `[steps + 1, ...]`."""
         steps = self._in_order(queue.ended.steps)
         kept = jax.tree.map(self._in_order, queue.traces)
@@ -281,22 +281,22 @@ class Evaluator:
         count, share = self.mesh.size, self.share
         dealt = np.minimum(np.arange(share * count), self.total - 1)
         dealt = dealt.reshape(share, count).T.reshape(-1)
-        bank = devices.put(jax.tree.map(lambda x: x[dealt], self.bank), self.mesh)
+        scenarios = devices.put(jax.tree.map(lambda x: x[dealt], self.scenarios), self.mesh)
         start = jax.jit(devices.over_lanes(self.robot.reset, self.mesh, [0, 0], 0))
-        return Share(start(bank.keys, bank.yaw), bank.target)
+        return Share(start(scenarios.keys, scenarios.yaw), scenarios.target)
 
     def _in_order(self, x: jax.Array) -> np.ndarray:
-        """Undoes the dealing out: `[devices × n, ...]` in the order of the bank."""
+        """Undoes the dealing out: `[devices × n, ...]` in the order of the scenarios."""
         dealt = np.asarray(x)
         rows = dealt.reshape(self.mesh.size, -1, *dealt.shape[1:])
         return rows.swapaxes(0, 1).reshape(dealt.shape)
 
 
-def _nothing(count: int) -> Outcome:
+def _nothing(count: int) -> EpisodeResults:
     def zeros(kind: Any = jnp.float32) -> jax.Array:
         return jnp.zeros(count, kind)  # an array of its own, as it is donated
 
-    return Outcome(
+    return EpisodeResults(
         zeros(), zeros(), zeros(bool), zeros(bool), zeros(bool), zeros(jnp.int32), zeros()
     )
 
@@ -307,24 +307,24 @@ class _Seen(NamedTuple):
     Attributes:
       episode: `[L]`, which of the n episodes the lane was at; n if at none.
       over: `[L]` bool, it has ended.
-      now: its Outcome `[L]` so far.
+      now: its EpisodeResults `[L]` so far.
       kept: what a trace keeps `[L, ...]` of the state after the step.
     """
 
     episode: jax.Array
     over: jax.Array
-    now: Outcome
+    now: EpisodeResults
     kept: Any
 
 
 def _chunk(
     robot: Robot,
-    settings: Test,
-    keep: Watch,
-    controller: Steering,
-    queue: Queue,
+    settings: EvaluationSettings,
+    keep: Record,
+    controller: ControllerFn,
+    queue: EvaluationState,
     shares: Share,
-) -> Queue:
+) -> EvaluationState:
     """`settings.chunk` steps of one device's lanes, then what they leave is written down."""
 
     def act(lanes: Running, _: None) -> tuple[State, jax.Array, Running]:
@@ -333,7 +333,7 @@ def _chunk(
 
     def watch(_: Running, move: Move) -> tuple[Running, _Seen]:
         lanes: Running = move.notes
-        now = _observe(lanes.now, move, lanes.target, settings.reach)
+        now = _observe(lanes.now, move, lanes.target, settings.goal_radius)
         over = now.reached | now.fell | now.diverged | (now.steps >= settings.max_steps)
         over &= lanes.episode < len(shares.target)
         seen = _Seen(lanes.episode, over, now, keep(move.after))
@@ -352,7 +352,7 @@ def _take(lanes: Running, shares: Share) -> Running:
     takes = idle & (rank < total)
     episode = jnp.where(takes, rank, lanes.episode).astype(jnp.int32)
     new = jax.tree.map(lambda x: x[jnp.minimum(episode, total - 1)], shares)
-    distance = horizontal(new.target - new.robots.position).astype(jnp.float32)
+    distance = horizontal_norm(new.target - new.robots.position).astype(jnp.float32)
     fresh = _nothing(episode.shape[0]).replace(closest=distance, start=distance)
     return Running(
         robots=select(takes, new.robots, lanes.robots),
@@ -363,22 +363,24 @@ def _take(lanes: Running, shares: Share) -> Running:
     )
 
 
-def _observe(now: Outcome, move: Move, target: jax.Array, reach: float) -> Outcome:
+def _observe(
+    now: EpisodeResults, move: Move, target: jax.Array, goal_radius: float
+) -> EpisodeResults:
     """The outcomes so far, with one more step in them."""
     o, o_next = move.before.position, move.after.position
-    distance = horizontal(target - o_next).astype(jnp.float32)
-    return Outcome(
+    distance = horizontal_norm(target - o_next).astype(jnp.float32)
+    return EpisodeResults(
         closest=jnp.minimum(now.closest, distance),
         start=now.start,
-        reached=distance <= reach,
+        reached=distance <= goal_radius,
         fell=move.after.fallen,
         diverged=move.after.diverged,
         steps=now.steps + 1,
-        path_length=now.path_length + horizontal(o_next - o).astype(jnp.float32),
+        path_length=now.path_length + horizontal_norm(o_next - o).astype(jnp.float32),
     )
 
 
-def _written(queue: Queue, seen: _Seen) -> Queue:
+def _written(queue: EvaluationState, seen: _Seen) -> EvaluationState:
     """The queue with what some steps `[T, L]` have left: results and traces."""
     slot = jnp.where(seen.over, seen.episode, len(queue.ended.steps))
 

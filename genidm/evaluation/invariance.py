@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import symmetry
-from genidm.evaluation.evaluate import Steering
+from genidm.evaluation.evaluate import ControllerFn
 from genidm.experience import Experience
 from genidm.robots.base import Robot
 
@@ -18,7 +18,11 @@ FAR = 3.0  # metres to a goal, where the robot's test has goals there
 
 
 def invariance(
-    robot: Robot, controller: Steering, s: jax.Array, displacement: jax.Array, angles: np.ndarray
+    robot: Robot,
+    controller: ControllerFn,
+    s: jax.Array,
+    relative_goal: jax.Array,
+    angles: np.ndarray,
 ) -> np.ndarray:
     """How much actions change when robot and goal are turned alike; 0 for exact invariance.
 
@@ -26,7 +30,7 @@ def invariance(
       robot: whose layout turns the states.
       controller: π.
       s: states `[N, S]`.
-      displacement: from the robots to their goals `[N, 3]`, metres.
+      relative_goal: from the robots to their goals `[N, 3]`, metres.
       angles: `[K]`, radians.
 
     Returns:
@@ -34,12 +38,12 @@ def invariance(
     """
 
     @jax.jit
-    def change(s: jax.Array, displacement: jax.Array, angle: jax.Array) -> jax.Array:
+    def change(s: jax.Array, relative_goal: jax.Array, angle: jax.Array) -> jax.Array:
         yaw = jnp.full(s.shape[0], angle)
-        turned = robot.observation.turn(s, yaw), symmetry.turn_vector(displacement, yaw)
-        return jnp.linalg.norm(controller(*turned) - controller(s, displacement), axis=-1)
+        turned = robot.observation.rotate(s, yaw), symmetry.rotate_vector(relative_goal, yaw)
+        return jnp.linalg.norm(controller(*turned) - controller(s, relative_goal), axis=-1)
 
-    return np.stack([np.asarray(change(s, displacement, a)) for a in angles])
+    return np.stack([np.asarray(change(s, relative_goal, a)) for a in angles])
 
 
 def probes(

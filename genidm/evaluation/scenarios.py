@@ -42,7 +42,7 @@ class Scenarios(flax.struct.PyTreeNode):
 
 
 # So that the scenarios of seed n are not the random numbers of a collecting seed n.
-BANK = 0x7E57
+SCENARIO_KEY = 0x7E57
 # Their starts lie in memory at once: a hundred times the paper's take a gigabyte for the Ant.
 MOST_EPISODES = 10**6
 
@@ -52,7 +52,7 @@ def scenarios(
 ) -> Scenarios:
     """The paper's test: random heading, target 2–5 m away within ±45° of the heading.
 
-    A function of the robot and the seeds alone; more episodes extend the same bank.
+    A function of the robot and the seeds alone; more episodes extend the same list.
     The target's height is that of a standing robot, so d is three-dimensional.
 
     Args:
@@ -70,12 +70,12 @@ def scenarios(
     check_value("first seed of a test", first_seed, seed())
     check_value("last seed of a test", first_seed + seeds - 1, seed())
     numbers = np.arange(first_seed, first_seed + seeds).astype(np.uint32)
-    return _bank(robot, numbers, np.arange(episodes, dtype=np.uint32))
+    return _scenarios(robot, numbers, np.arange(episodes, dtype=np.uint32))
 
 
-def _bank(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenarios:
+def _scenarios(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenarios:
     def one(seed: jax.Array, episode: jax.Array) -> tuple[jax.Array, ...]:
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(BANK), seed), episode)
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(SCENARIO_KEY), seed), episode)
         start, turn, far, side = jax.random.split(key, 4)
         low, high = robot.target_distance
         return (
@@ -109,22 +109,22 @@ def toward(
 
 # Fig. 8: ten episodes where the robot starts as it did while it learned, and ten where it
 # faces almost the other way.
-TOUR = 10
+FIG8_EPISODES = 10
 UNSEEN_YAW = 0.75 * np.pi
 
 
-def tours(robot: Robot) -> Scenarios:
+def fig8_scenarios(robot: Robot) -> Scenarios:
     """The scenarios of Fig. 8, `[2, 10]`: one fixed start each, targets 3–5 m ahead.
 
     Row 0 starts at yaw 0, as all experience did; row 1 turned by 135°.
     """
     low, high = robot.target_distance
-    far = jnp.linspace((low + high) / 2, high, TOUR, dtype=jnp.float32)
-    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, TOUR, dtype=jnp.float32)
-    shape = (2, TOUR)
+    far = jnp.linspace((low + high) / 2, high, FIG8_EPISODES, dtype=jnp.float32)
+    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, FIG8_EPISODES, dtype=jnp.float32)
+    shape = (2, FIG8_EPISODES)
     return toward(
         robot,
-        keys=jnp.broadcast_to(jax.random.key(BANK), shape),
+        keys=jnp.broadcast_to(jax.random.key(SCENARIO_KEY), shape),
         yaw=jnp.broadcast_to(jnp.asarray([[0.0], [UNSEEN_YAW]], jnp.float32), shape),
         distance=jnp.broadcast_to(far, shape),
         bearing=jnp.broadcast_to(side, shape),

@@ -95,9 +95,9 @@ def improvement(difference: Array) -> float:
 
 
 def common(a: Episodes, b: Episodes) -> tuple[Episodes, Episodes]:
-    """The part of two tests that both made, where one stopped earlier in the same bank.
+    """The part of two tests that both made, where one stopped earlier in the same scenarios.
 
-    A bank with fewer seeds or episodes is the beginning of one with more.
+    Scenarios with fewer seeds or episodes are the beginning of one with more.
     """
     seeds, episodes = map(min, zip(a.closest.shape, b.closest.shape, strict=True))
 

@@ -16,25 +16,25 @@ from jax.sharding import Mesh
 from genidm import devices
 from genidm.checks import check, count, positive
 from genidm.errors import BadInput
-from genidm.evaluation.evaluator import MOST_AT_ONCE, Steering, as_tree, ask, steered
-from genidm.progress import Progress, compiled
+from genidm.evaluation.evaluator import MOST_AT_ONCE, ControllerFn, as_tree, ask, steered
+from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
-from genidm.symmetry import horizontal, wrap
+from genidm.symmetry import horizontal_norm, wrap
 
 # (o [B, 3], waypoints [B, W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
 # metres, world frame; asked anew at each step.
 Planner = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
-def straight(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
+def first_unreached(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
     """Straight to the first waypoint that is left; to the last one when none is."""
     first = jnp.where(left.any(-1), jnp.argmax(left, axis=-1), waypoints.shape[1] - 1)
     return jnp.take_along_axis(waypoints, first[:, None, None], axis=1)[:, 0]
 
 
 # State [B] → a tree of arrays [B, ...]: what is kept of every state on the way.
-Watch = Callable[[State], Any]
+Record = Callable[[State], Any]
 
 
 def nothing(_: State) -> tuple[()]:
@@ -43,26 +43,26 @@ def nothing(_: State) -> tuple[()]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Follow:
+class WaypointSettings:
     """Settings of a journey.
 
     Attributes:
       max_steps: it ends after this many steps.
-      reach: metres, horizontal; a waypoint is reached when it is this near and its turn.
+      goal_radius: metres, horizontal; a waypoint is reached when it is this near and its turn.
       chunk: steps a program call.
     """
 
     max_steps: int = 2000
-    reach: float = 0.25
+    goal_radius: float = 0.25
     chunk: int = 50
 
     def __post_init__(self) -> None:
         steps, chunk = count(1, 10**6), count(1, MOST_AT_ONCE)
-        check(self, max_steps=steps, chunk=chunk, reach=positive())
+        check(self, max_steps=steps, chunk=chunk, goal_radius=positive())
 
 
 @dataclasses.dataclass(frozen=True)
-class Journeys:
+class WaypointRuns:
     """B journeys through W waypoints, over T steps at most.
 
     Attributes:
@@ -72,8 +72,8 @@ class Journeys:
       steps: `[B]`, that were made.
       arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
       fell: `[B]` bool; ended by a fall, or by physics that diverged.
-      control_step: seconds.
-      watched: tree of arrays `[B, T + 1, ...]`, that was asked for beside.
+      dt: seconds.
+      recorded: tree of arrays `[B, T + 1, ...]`, that was asked for beside.
     """
 
     waypoints: np.ndarray
@@ -82,8 +82,8 @@ class Journeys:
     steps: np.ndarray
     arrival: np.ndarray
     fell: np.ndarray
-    control_step: float
-    watched: Any = ()
+    dt: float
+    recorded: Any = ()
 
     @property
     def made(self) -> np.ndarray:
@@ -93,10 +93,10 @@ class Journeys:
     @property
     def times(self) -> np.ndarray:
         """Seconds to each waypoint `[B, W]`; NaN where it was not reached."""
-        return np.where(self.arrival < 0, np.nan, self.arrival * self.control_step)
+        return np.where(self.arrival < 0, np.nan, self.arrival * self.dt)
 
     @property
-    def deviation(self) -> np.ndarray:
+    def cross_track_error(self) -> np.ndarray:
         """Metres `[B, T + 1]` from the leg that the robot was on; NaN after the end.
 
         A leg is the straight line from the last waypoint, at first the start, to the next.
@@ -110,7 +110,7 @@ class Journeys:
         return np.where(self.made, apart, np.nan)
 
     @property
-    def askew(self) -> np.ndarray:
+    def heading_error(self) -> np.ndarray:
         """Radians `[B, T]` between the heading and the motion; NaN where there is none."""
         motion = np.diff(self.position[..., :2], axis=1)
         course = np.arctan2(motion[..., 1], motion[..., 0])
@@ -120,12 +120,14 @@ class Journeys:
 
     def summary(self) -> dict[str, Any]:
         """Means over the journeys: metres, seconds, radians, shares of the journeys."""
-        reached, askew = self.arrival >= 0, self.askew
+        reached, heading_error = self.arrival >= 0, self.heading_error
         times = [t[np.isfinite(t)] for t in self.times.T]
         return {
-            "journeys": len(self.steps),
-            "deviation": float(np.nanmean(self.deviation)),
-            "askew": float(np.nanmean(askew)) if np.isfinite(askew).any() else None,
+            "runs": len(self.steps),
+            "cross_track_error": float(np.nanmean(self.cross_track_error)),
+            "heading_error": float(np.nanmean(heading_error))
+            if np.isfinite(heading_error).any()
+            else None,
             "reached": reached.mean(0).tolist(),
             "seconds": [float(t.mean()) if len(t) else None for t in times],
             "fell": float(self.fell.mean()),
@@ -160,19 +162,19 @@ class Walker(flax.struct.PyTreeNode):
     going: jax.Array
 
 
-def follow(
+def follow_waypoints(
     robot: Robot,
-    controller: Steering,
+    controller: ControllerFn,
     waypoints: np.ndarray,
     keys: jax.Array,
     yaw: jax.Array,
-    planner: Planner = straight,
-    settings: Follow | None = None,
+    planner: Planner = first_unreached,
+    settings: WaypointSettings | None = None,
     *,
-    watch: Watch = nothing,
+    record: Record = nothing,
     mesh: Mesh | None = None,
     quiet: bool = False,
-) -> Journeys:
+) -> WaypointRuns:
     """Leads robots through waypoints, each in its turn.
 
     Args:
@@ -183,8 +185,8 @@ def follow(
       keys: `[B]`, of the starts.
       yaw: `[B]`, radians, that the starts are turned by.
       planner: where to go next; straight to the next waypoint, unless given.
-      settings: length of a journey, reach.
-      watch: what to keep of every state beside position and heading; nothing, unless given.
+      settings: length of a journey, goal radius.
+      record: what to keep of every state beside position and heading; nothing, unless given.
       mesh: devices to share the robots among; as their engine wants, unless given.
       quiet: no progress bar.
 
@@ -192,7 +194,7 @@ def follow(
       BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key; no
         robots; planner or controller answer something else than they should.
     """
-    settings, mesh = settings or Follow(), mesh or robot.mesh()
+    settings, mesh = settings or WaypointSettings(), mesh or robot.mesh()
     if jnp.ndim(keys) != 1 or jnp.shape(yaw) != keys.shape:
         raise BadInput(f"keys [B] and yaw [B] are of {jnp.shape(keys)} and {jnp.shape(yaw)}")
     if not len(keys):
@@ -200,19 +202,19 @@ def follow(
     points = _checked(waypoints, len(keys), robot.standing_height)
     walker = _start(robot, points, keys, yaw, mesh)
     controller = devices.put(as_tree(controller), mesh, None)
-    look = functools.partial(_seen, watch)
+    look = functools.partial(_seen, record)
     body = functools.partial(_chunk, robot, planner, settings, look)
     sharded = devices.over_lanes(body, mesh, [None, 0], (0, 1))
-    step = compiled("journeys", jax.jit(sharded, donate_argnums=1), controller, walker)
+    step = compile_ahead("waypoints", jax.jit(sharded, donate_argnums=1), controller, walker)
     seen = [jax.tree.map(lambda x: np.asarray(x)[None], look(walker.robots))]
-    with Progress("journeys", settings.max_steps, "steps", quiet=quiet) as bar:
+    with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
         for made in range(0, settings.max_steps, settings.chunk):
             walker, way = step(controller, walker)
             seen.append(jax.tree.map(np.asarray, way))
             bar.advance(min(settings.chunk, settings.max_steps - made))
             if not np.asarray(walker.going).any():
                 break
-    return _journeys(robot, walker, seen, len(yaw))
+    return _waypoint_runs(robot, walker, seen, len(yaw))
 
 
 def in_twos(numbers: Sequence[float]) -> np.ndarray:
@@ -239,11 +241,11 @@ def _start(robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, me
     return devices.put(walker, mesh)
 
 
-def _seen(watch: Watch, robots: State) -> tuple[jax.Array, jax.Array, Any]:
-    return robots.position, robots.heading, watch(robots)
+def _seen(record: Record, robots: State) -> tuple[jax.Array, jax.Array, Any]:
+    return robots.position, robots.heading, record(robots)
 
 
-def _journeys(robot: Robot, walker: Walker, seen: list[Any], count: int) -> Journeys:
+def _waypoint_runs(robot: Robot, walker: Walker, seen: list[Any], count: int) -> WaypointRuns:
     """What has become of the first `count` robots, seen `[steps, B, ...]` again and again."""
     steps = np.asarray(walker.steps)[:count]
     end = steps.max() + 1  # the last chunk may go on beyond it
@@ -251,17 +253,17 @@ def _journeys(robot: Robot, walker: Walker, seen: list[Any], count: int) -> Jour
     def join(*parts: Any) -> np.ndarray:
         return np.concatenate(parts).swapaxes(0, 1)[:count, :end]
 
-    position, heading, watched = jax.tree.map(join, *seen)
+    position, heading, recorded = jax.tree.map(join, *seen)
     robots = walker.robots
-    return Journeys(
+    return WaypointRuns(
         waypoints=np.asarray(walker.waypoints)[:count],
         position=position,
         heading=heading,
         steps=steps,
         arrival=np.asarray(walker.arrival)[:count],
         fell=np.asarray(robots.fallen | robots.diverged)[:count],
-        control_step=robot.control_step,
-        watched=watched,
+        dt=robot.dt,
+        recorded=recorded,
     )
 
 
@@ -287,9 +289,9 @@ def _checked(waypoints: Any, count: int, height: float) -> np.ndarray:
 def _chunk(
     robot: Robot,
     planner: Planner,
-    settings: Follow,
-    look: Watch,
-    controller: Steering,
+    settings: WaypointSettings,
+    look: Record,
+    controller: ControllerFn,
     walker: Walker,
 ) -> tuple[Walker, Any]:
     """`settings.chunk` steps; and what is seen `[chunk, B, ...]` after each.
@@ -308,7 +310,7 @@ def _chunk(
     def watch(walker: Walker, move: Move) -> tuple[Walker, Any]:
         after, steps, left = move.after, walker.steps + 1, walker.arrival < 0
         turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
-        near = horizontal(points - after.position[:, None]) <= settings.reach
+        near = horizontal_norm(points - after.position[:, None]) <= settings.goal_radius
         arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
         through = (arrival >= 0).all(-1)
         over = after.fallen | after.diverged | through | (steps >= settings.max_steps)

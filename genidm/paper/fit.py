@@ -18,7 +18,7 @@ from genidm.errors import BadInput
 from genidm.paper import protocol
 from genidm.paper.idm import Architecture, loss_plain, loss_siamese
 from genidm.paper.pairs import Pairs
-from genidm.progress import Progress, compiled
+from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot
 from genidm.store import Stage
 
@@ -36,40 +36,46 @@ class Fit:
 
     Attributes:
       updates: minibatches learned from.
-      batch: samples a minibatch (A.1.2: 512).
+      batch_size: samples a minibatch (A.1.2: 512).
       learning_rate: of Adam (A.1.2: 1e-3), at the start.
-      decay: the learning rate falls to 0 along a cosine; off, it stays (the paper's).
+      cosine_decay: the learning rate falls to 0 along a cosine; off, it stays (the paper's).
       idm: hidden layers of φ (Table 2).
       lfm: hidden layers of ψ (Table 2).
       latent_size: k; None fits an IDM alone.
-      latent_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
-      averaged: φ is fitted to the mean of a pair's latents (Eq. 6); off, to each of them. The
+      latent_loss_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
+      mean_latent: φ is fitted to the mean of a pair's latents (Eq. 6); off, to each of them. The
         mean hides what the two differ by, and in the test there is one latent alone.
     """
 
     updates: int = 20_000
-    batch: int = protocol.BATCH_SIZE
+    batch_size: int = protocol.BATCH_SIZE
     learning_rate: float = protocol.LEARNING_RATE
-    decay: bool = True
+    cosine_decay: bool = True
     idm: tuple[int, ...] = (256, 256)
     lfm: tuple[int, ...] = (256, 256)
     latent_size: int | None = None
-    latent_weight: float = protocol.LATENT_WEIGHT
-    averaged: bool = True
+    latent_loss_weight: float = protocol.LATENT_WEIGHT
+    mean_latent: bool = True
 
     def __post_init__(self) -> None:
         check(
-            self, {"latent_weight": "λ (latent_weight)", "latent_size": "k (latent_size)"},
-            updates=count(), batch=count(1, MOST_IN_BATCH), learning_rate=positive(),
-            idm=layers, lfm=layers,
+            self,
+            {"latent_loss_weight": "λ (latent_loss_weight)", "latent_size": "k (latent_size)"},
+            updates=count(),
+            batch_size=count(1, MOST_IN_BATCH),
+            learning_rate=positive(),
+            idm=layers,
+            lfm=layers,
             latent_size=optional(count(1, WIDEST)),
-            latent_weight=number(0, 1, above=True, below=True),
-        )  # fmt: skip
+            latent_loss_weight=number(0, 1, above=True, below=True),
+        )
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam, with the schedule."""
         rate = self.learning_rate
-        return optax.adam(optax.cosine_decay_schedule(rate, self.updates) if self.decay else rate)
+        return optax.adam(
+            optax.cosine_decay_schedule(rate, self.updates) if self.cosine_decay else rate
+        )
 
 
 def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:
@@ -89,7 +95,7 @@ def draw_siamese(samples: Pairs, key: jax.Array, size: int) -> Pairs:
     return Pairs(samples.s[both, n], samples.d[both, n], samples.a[n])
 
 
-class Learner(flax.struct.PyTreeNode):
+class FitState(flax.struct.PyTreeNode):
     """All that a fit carries from one update to the next."""
 
     model: Controller
@@ -104,7 +110,7 @@ def fit(
     key: jax.Array,
     settings: Fit | None = None,
     *,
-    frame: Frame = "world",
+    input_frame: Frame = "world",
     stage: Stage | None = None,
     chunk: int = 1000,
     quiet: bool = False,
@@ -117,7 +123,7 @@ def fit(
         one device while they are learned from: an accelerator if it has the room, else the CPU.
       key: of the parameters and the minibatches.
       settings: networks, losses, schedule.
-      frame: the frame that the models see s and d in.
+      input_frame: the frame that the models see s and d in.
       stage: where checkpoints and metrics go; nowhere, unless given.
       chunk: updates a program call.
       quiet: no progress bar.
@@ -129,13 +135,15 @@ def fit(
     settings = settings or Fit()
     if settings.latent_size is not None and samples.s.shape[0] < 2:
         raise BadInput("an LFM is fitted to pairs, and these samples have one view only")
-    samples = jax.device_put(samples, devices.home(sum(x.nbytes for x in jax.tree.leaves(samples))))
-    samples = jax.jit(functools.partial(_framed, robot, frame))(samples)
-    learner, updates = training(robot, samples, key, settings, frame)
+    samples = jax.device_put(
+        samples, devices.pick_device(sum(x.nbytes for x in jax.tree.leaves(samples)))
+    )
+    samples = jax.jit(functools.partial(_framed, robot, input_frame))(samples)
+    learner, updates = training(robot, samples, key, settings, input_frame)
     checkpoints = stage.checkpoints() if stage else None
     found = checkpoints.latest(learner) if checkpoints else None
     done, learner = (found[0], _beside(samples, found[1])) if found else (0, learner)
-    program = compiled("fit", updates, learner, samples, jnp.int32(0))
+    program = compile_ahead("fit", updates, learner, samples, jnp.int32(0))
     directory = stage.directory if stage else None
     with Progress("fit", settings.updates, "updates", directory, done, quiet) as bar:
         while done < settings.updates:
@@ -158,22 +166,22 @@ def _check_fitted(model: Controller, updates: int) -> None:
 
 
 def training(
-    robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: Frame = "world"
-) -> tuple[Learner, Any]:
+    robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, input_frame: Frame = "world"
+) -> tuple[FitState, Any]:
     """A fit before its first update, and the program of its updates.
 
     Args:
       robot: whose states and actions the samples hold.
-      samples: `[V, N, ...]`, with s and d in `frame` already, on one device.
+      samples: `[V, N, ...]`, with s and d in `input_frame` already, on one device.
       key: of the parameters and the minibatches.
       settings: networks, losses, schedule.
-      frame: the frame that the controller turns what it is given into.
+      input_frame: the frame that the controller turns what it is given into.
 
     Returns:
       the learner, and the jitted (learner, samples, count) → (learner, mean losses) of
       `count` updates, which donates the learner.
     """
-    learner = _start(robot, samples, key, settings, frame)
+    learner = _start(robot, samples, key, settings, input_frame)
     return learner, jax.jit(_updates(settings), donate_argnums=0)
 
 
@@ -182,12 +190,14 @@ def _beside(samples: Pairs, tree: Any) -> Any:
     return jax.device_put(tree, jnp.asarray(samples.a).device)
 
 
-def _framed(robot: Robot, frame: Frame, samples: Pairs) -> Pairs:
-    s, d = in_frame(robot, frame, samples.s, samples.d)
+def _framed(robot: Robot, input_frame: Frame, samples: Pairs) -> Pairs:
+    s, d = in_frame(robot, input_frame, samples.s, samples.d)
     return Pairs(s, d, samples.a)
 
 
-def _start(robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: Frame) -> Learner:
+def _start(
+    robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, input_frame: Frame
+) -> FitState:
     params, stream = jax.random.split(key)
     architecture = Architecture(robot.action.size, settings.idm, settings.lfm, settings.latent_size)
     mean, std = jax.jit(lambda s: (s.mean((0, 1)), s.std((0, 1))))(samples.s)
@@ -196,11 +206,11 @@ def _start(robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, frame: F
         mean=mean,
         std=jnp.maximum(std, STD_FLOOR),
         architecture=architecture,
-        frame=frame,
+        input_frame=input_frame,
         robot=robot,
     )
     state = settings.optimizer().init(model.params)
-    return _beside(samples, Learner(model, state, stream, jnp.zeros((), jnp.int32)))
+    return _beside(samples, FitState(model, state, stream, jnp.zeros((), jnp.int32)))
 
 
 def _updates(settings: Fit) -> Any:
@@ -209,16 +219,18 @@ def _updates(settings: Fit) -> Any:
     draw = draw_siamese if siamese else draw_plain
     loss = (
         functools.partial(
-            loss_siamese, latent_weight=settings.latent_weight, averaged=settings.averaged
+            loss_siamese,
+            latent_loss_weight=settings.latent_loss_weight,
+            mean_latent=settings.mean_latent,
         )
         if siamese
         else loss_plain
     )
     optimizer = settings.optimizer()
 
-    def update(learner: Learner, samples: Pairs) -> tuple[Learner, dict[str, jax.Array]]:
+    def update(learner: FitState, samples: Pairs) -> tuple[FitState, dict[str, jax.Array]]:
         # The key of an update depends on its number alone, not on the call it is in.
-        batch = draw(samples, jax.random.fold_in(learner.key, learner.update), settings.batch)
+        batch = draw(samples, jax.random.fold_in(learner.key, learner.update), settings.batch_size)
 
         def of_params(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
             return loss(learner.model.replace(params=params), batch)
@@ -226,10 +238,10 @@ def _updates(settings: Fit) -> Any:
         grads, info = jax.grad(of_params, has_aux=True)(learner.model.params)
         step, state = optimizer.update(grads, learner.optimizer)
         model = learner.model.replace(params=optax.apply_updates(learner.model.params, step))
-        return Learner(model, state, learner.key, learner.update + 1), info
+        return FitState(model, state, learner.key, learner.update + 1), info
 
-    def run(learner: Learner, samples: Pairs, count: jax.Array) -> tuple[Learner, dict]:
-        def body(_: int, carry: tuple[Learner, dict]) -> tuple[Learner, dict]:
+    def run(learner: FitState, samples: Pairs, count: jax.Array) -> tuple[FitState, dict]:
+        def body(_: int, carry: tuple[FitState, dict]) -> tuple[FitState, dict]:
             learner, info = update(carry[0], samples)
             return learner, jax.tree.map(jnp.add, carry[1], info)
 

@@ -23,7 +23,7 @@ from genidm.engines import Engine
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.paper.pairs import Pairs, pairs
-from genidm.paper.replaying import Blocks, Replay, Runner
+from genidm.paper.replaying import Blocks, RotatedReplay, Runner
 from genidm.progress import Progress
 from genidm.robots.base import Robot
 
@@ -40,16 +40,16 @@ class Generalize:
         exactly, without physics.
       segment: steps of a segment, H; as many as the robot's engine allows, unless given.
       copies: turned copies of the record.
-      lanes: robots replayed at once; see `Robot.at_once`.
+      num_envs: robots replayed at once; see `Robot.max_parallel_envs`.
     """
 
     mode: Mode = "segments"
     segment: int | None = None
     copies: int = 1
-    lanes: int = 512
+    num_envs: int = 512
 
     def __post_init__(self) -> None:
-        check(self, segment=optional(count()), copies=count(1, 1000), lanes=count())
+        check(self, segment=optional(count()), copies=count(1, 1000), num_envs=count())
 
     def on(self, robot: Robot) -> Generalize:
         """The settings with a segment's length chosen for the robot, unless it is given."""
@@ -67,7 +67,7 @@ def replay(
     *,
     mesh: Mesh | None = None,
     quiet: bool = False,
-) -> Replay:
+) -> RotatedReplay:
     """𝒢(E): the record's actions replayed from starts turned by random yaws.
 
     Args:
@@ -83,14 +83,14 @@ def replay(
     """
     settings = (settings or Generalize()).on(robot)
     if settings.mode == "rotate":
-        return rotate(robot, experience, key, settings.copies)
+        return rotate_exactly(robot, experience, key, settings.copies)
     experience = experience.prepared(robot)
     if experience.physics is None:
         raise BadInput('this experience holds no physics to replay from: use mode "rotate"')
     mesh = mesh or robot.mesh()
     assert settings.segment
     follow = settings.mode == "episodes"
-    lanes = robot.at_once(settings.lanes)
+    lanes = robot.max_parallel_envs(settings.num_envs)
     blocks = Blocks(experience, settings.segment, lanes, mesh.size, follow=follow)
     runner = Runner(robot, mesh, blocks.example(key))
     copies = []
@@ -98,26 +98,30 @@ def replay(
         for copy_key in jax.random.split(key, settings.copies):
             copies.append(blocks.gather(runner.over(blocks, copy_key, bar)))
     s, o, o_next, yaw, valid = (np.stack(x) for x in zip(*copies, strict=True))
-    return Replay(s, o, o_next, yaw, blocks.start, valid)
+    return RotatedReplay(s, o, o_next, yaw, blocks.start, valid)
 
 
-def rotate(robot: Robot, experience: Experience, key: jax.Array, copies: int = 1) -> Replay:
+def rotate_exactly(
+    robot: Robot, experience: Experience, key: jax.Array, copies: int = 1
+) -> RotatedReplay:
     """The record turned exactly, each sample by a yaw of its own, without physics."""
     experience = experience.prepared(robot)
     shape = (copies, *experience.first.shape)
     yaw = jax.random.uniform(key, shape, jnp.float32, minval=-jnp.pi, maxval=jnp.pi)
-    turn = jax.vmap(symmetry.turn_vector, (None, 0))
-    return Replay(
-        s=jax.vmap(robot.observation.turn, (None, 0))(jnp.asarray(experience.s), yaw),
-        o=turn(jnp.asarray(experience.o), yaw),
-        o_next=turn(jnp.asarray(experience.o_next), yaw),
+    rotated = jax.vmap(symmetry.rotate_vector, (None, 0))
+    return RotatedReplay(
+        s=jax.vmap(robot.observation.rotate, (None, 0))(jnp.asarray(experience.s), yaw),
+        o=rotated(jnp.asarray(experience.o), yaw),
+        o_next=rotated(jnp.asarray(experience.o_next), yaw),
         yaw=yaw,
         start=jnp.broadcast_to(jnp.arange(shape[1])[:, None], shape[1:]),
         valid=jnp.broadcast_to(jnp.asarray(experience.valid), shape),
     )
 
 
-def residual(experience: Experience, turned: Replay, steps: int = 200) -> dict[str, np.ndarray]:
+def residual(
+    experience: Experience, turned: RotatedReplay, steps: int = 200
+) -> dict[str, np.ndarray]:
     """How far the replay leaves the exact rotation of the record (e.m.o., Def. 3).
 
     Args:
@@ -131,7 +135,7 @@ def residual(experience: Experience, turned: Replay, steps: int = 200) -> dict[s
     """
     record = experience.centred() if experience.far_away else experience
     o_next = jnp.asarray(record.o_next, jnp.float32)
-    exact = jax.vmap(symmetry.turn_vector, (None, 0))(o_next, turned.yaw)
+    exact = jax.vmap(symmetry.rotate_vector, (None, 0))(o_next, turned.yaw)
     distance = np.linalg.norm(np.asarray(exact) - turned.o_next, axis=-1)
     since = np.arange(distance.shape[1])[:, None] - turned.start
     rows = []
@@ -149,7 +153,7 @@ def generalize(
     key: jax.Array,
     settings: Generalize | None = None,
     *,
-    look_ahead: int = 100,
+    goal_horizon: int = 100,
     mirror: bool = False,
 ) -> tuple[Pairs, dict[str, np.ndarray]]:
     """𝒢 from record to Pairs, and the e.m.o. residual; `replay` and `pairs` in one.
@@ -159,12 +163,12 @@ def generalize(
       experience: E, `[T, B, ...]`.
       key: of the yaws.
       settings: of 𝒢.
-      look_ahead: h, steps to the intermediate goal o'.
+      goal_horizon: h, steps to the intermediate goal o'.
       mirror: adds the reflection of every sample; not in the paper.
 
     Returns:
       the samples, and the residual as `residual` gives it, in metres.
     """
     turned = replay(robot, experience, key, settings)
-    samples = pairs(robot, experience, turned, look_ahead=look_ahead, mirror=mirror)
+    samples = pairs(robot, experience, turned, goal_horizon=goal_horizon, mirror=mirror)
     return samples, residual(experience, turned)

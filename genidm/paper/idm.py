@@ -19,16 +19,16 @@ class MLP(nn.Module):
     """A multilayer perceptron with ReLU, linear at the end.
 
     Attributes:
-      hidden: widths of the hidden layers.
+      policy_hidden_layer_sizes: widths of the hidden layers.
       outputs: width of the output.
     """
 
-    hidden: tuple[int, ...]
+    policy_hidden_layer_sizes: tuple[int, ...]
     outputs: int
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        for width in self.hidden:
+        for width in self.policy_hidden_layer_sizes:
             x = nn.relu(nn.Dense(width)(x))
         return nn.Dense(self.outputs)(x)
 
@@ -115,13 +115,13 @@ def loss_plain(model: Model, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Arr
 
 
 def loss_siamese(
-    model: Model, batch: Pairs, latent_weight: float, averaged: bool
+    model: Model, batch: Pairs, latent_loss_weight: float, mean_latent: bool
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees their mean latent, or each."""
     latents = model.latent(batch.s, batch.d)
     latent = loss_latent(latents[0], latents[1])
-    seen = latents.mean(0, keepdims=True) if averaged else latents
+    seen = latents.mean(0, keepdims=True) if mean_latent else latents
     predicted = model.action(seen)
     action = loss_action(predicted, jnp.broadcast_to(batch.a, predicted.shape))
-    loss = latent_weight * latent + (1 - latent_weight) * action
+    loss = latent_loss_weight * latent + (1 - latent_loss_weight) * action
     return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}

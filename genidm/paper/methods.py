@@ -43,7 +43,7 @@ class Method:
 
 
 @dataclasses.dataclass(frozen=True)
-class Direct(Method):
+class GoalConditioned(Method):
     """A baseline (§5.1): the agent learns to go to goals, and its policy is the controller."""
 
     agent: PPO | SAC | DDPG
@@ -51,34 +51,43 @@ class Direct(Method):
 
 
 @dataclasses.dataclass(frozen=True)
-class Inverse(Method):
+class InverseDynamics(Method):
     """From experience that was never goal-directed to a controller, by inverse dynamics (§4).
 
     Attributes:
-      share: the part of the record, from its start, that is learned from. The paper's GE
+      fraction: the part of the record, from its start, that is learned from. The paper's GE
         and LR make the other half with 𝒢 (A.1.2).
       generalize: settings of 𝒢; None learns from the record alone.
-      look_ahead: h, steps to the intermediate goal o'; 1 is the paper's "next position".
+      goal_horizon: h, steps to the intermediate goal o'; 1 is the paper's "next position".
         Steps whose episode ends before are left out.
       mirror: adds the reflection of every sample; not in the paper.
-      frame: "heading" turns every input so that the robot faces +x; not in the paper.
+      input_frame: "heading" turns every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
     """
 
-    share: float
+    fraction: float
     generalize: Generalize | None
-    look_ahead: int
+    goal_horizon: int
     mirror: bool
-    frame: Frame
+    input_frame: Frame
     fit: Fit
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, share=positive(1), look_ahead=count())
+        check(self, fraction=positive(1), goal_horizon=count())
 
 
-Methods = tuple[Direct | Inverse, ...]
-Column = tuple[Inverse, Inverse, Direct, Direct, Direct, Inverse, Inverse, Inverse]
+Methods = tuple[GoalConditioned | InverseDynamics, ...]
+Column = tuple[
+    InverseDynamics,
+    InverseDynamics,
+    GoalConditioned,
+    GoalConditioned,
+    GoalConditioned,
+    InverseDynamics,
+    InverseDynamics,
+    InverseDynamics,
+]
 
 WALK = WalkForward()
 
@@ -93,14 +102,14 @@ class Choices:
       ppo: settings of PPO.
       sac: settings of SAC.
       ddpg: settings of DDPG.
-      look_ahead: h of what is learned from random actions (RS).
+      goal_horizon: h of what is learned from random actions (RS).
       mirror: whether HF also learns from mirror images: where the gait is its own.
     """
 
     ppo: PPO = dataclasses.field(default_factory=PPO)
     sac: SAC = dataclasses.field(default_factory=SAC)
     ddpg: DDPG = dataclasses.field(default_factory=DDPG)
-    look_ahead: int = 100
+    goal_horizon: int = 100
     mirror: bool = True
 
     def agent(self, training: protocol.Training, her: HER | None = None) -> PPO | SAC | DDPG:
@@ -108,7 +117,9 @@ class Choices:
         agents: dict[str, Any] = {"PPO": self.ppo, "SAC": self.sac, "DDPG": self.ddpg}
         relabelling = {"her": her} if her else {}
         agent: PPO | SAC | DDPG = dataclasses.replace(
-            agents[training.algorithm or ""], hidden=training.policy, **relabelling
+            agents[training.algorithm or ""],
+            policy_hidden_layer_sizes=training.policy,
+            **relabelling,
         )
         return agent
 
@@ -117,36 +128,36 @@ def column(robot: str, choices: Choices) -> Column:
     """Table 1's rows for one robot as Table 2 and A.1.2 have them, and HF."""
     table = protocol.TABLE2[robot]
 
-    def inverse(name: str, latent_size: int | None = None) -> Inverse:
+    def inverse(name: str, latent_size: int | None = None) -> InverseDynamics:
         idm, lfm = table[name].idm or (), table[name].lfm or Fit.lfm
-        return Inverse(
+        return InverseDynamics(
             name=name,
             agent=_collector(robot, choices, table[name]),
             task=WALK,
-            share=protocol.FRACTION[name],
+            fraction=protocol.FRACTION[name],
             generalize=Generalize() if name in ("GE", "LR") else None,
-            look_ahead=100,
+            goal_horizon=100,
             mirror=False,
-            frame="world",
+            input_frame="world",
             fit=Fit(idm=idm, lfm=lfm, latent_size=latent_size),
         )
 
-    def direct(name: str, task: GoToGoal, her: HER | None = None) -> Direct:
-        return Direct(name, choices.agent(table[name], her), task)
+    def direct(name: str, task: GoToGoal, her: HER | None = None) -> GoalConditioned:
+        return GoalConditioned(name, choices.agent(table[name], her), task)
 
     lr = inverse("LR", protocol.LATENT_SIZE[robot])
-    # λ and latents as measured (docs/choices.md); `literal` has the paper's.
-    lr_fit = dataclasses.replace(lr.fit, latent_weight=0.75, averaged=False)
+    # λ and latents as measured (docs/choices.md); `paper_settings` has the paper's.
+    lr_fit = dataclasses.replace(lr.fit, latent_loss_weight=0.75, mean_latent=False)
     rl = inverse("RL")
     return (
-        dataclasses.replace(inverse("RS"), look_ahead=choices.look_ahead),
+        dataclasses.replace(inverse("RS"), goal_horizon=choices.goal_horizon),
         rl,
         direct("VGCP", GoToGoal()),
         direct("HER_SP", GoToGoal(reward=Sparse()), HER()),
         direct("HER_DE", GoToGoal(reward=Dense()), HER()),
         inverse("GE"),
         dataclasses.replace(lr, fit=lr_fit),
-        dataclasses.replace(rl, name="HF", mirror=choices.mirror, frame="heading"),
+        dataclasses.replace(rl, name="HF", mirror=choices.mirror, input_frame="heading"),
     )
 
 
@@ -160,7 +171,7 @@ def _collector(
     before = protocol.LEARNED_BEFORE.get(robot)
     if before is None:
         return agent
-    return Frozen(agent, share=before / protocol.INTERACTIONS[robot])
+    return Frozen(agent, fraction=before / protocol.INTERACTIONS[robot])
 
 
 ANT = column("ant", Choices())
@@ -168,9 +179,9 @@ HUMANOID = column(
     "humanoid",
     Choices(
         # Of 0.0165 s a step: at 0.98 the agent would look 0.8 s ahead, and throw itself forwards.
-        sac=SAC(updates=64, discount=0.99, layer_norm=True),
+        sac=SAC(grad_updates_per_step=64, discounting=0.99, layer_norm=True),
         # Moved at random it lies down within 25 steps: farther ahead there is nothing to be seen.
-        look_ahead=10,
+        goal_horizon=10,
         # The gait is not its own mirror image: fitted to both, HF falls (docs/choices.md).
         mirror=False,
     ),
@@ -180,7 +191,7 @@ MINITAUR = column(
     Choices(
         # It stands by itself, so nothing is paid for noise, which would hide the gait
         # (docs/choices.md).
-        ppo=PPO(entropy=0.0),
+        ppo=PPO(entropy_cost=0.0),
         # This gait veers to one side: it is not its own mirror image, either.
         mirror=False,
     ),
@@ -203,7 +214,7 @@ TABLES = {
 """Robot → the methods of its column. A robot without one has the Ant's."""
 
 
-def by_name(name: str, robot: str = "ant") -> Direct | Inverse:
+def by_name(name: str, robot: str = "ant") -> GoalConditioned | InverseDynamics:
     """The method of that name, with its settings for a robot.
 
     Raises:
@@ -215,7 +226,7 @@ def by_name(name: str, robot: str = "ant") -> Direct | Inverse:
     raise BadInput(f"no method is called {name!r}; there are: {', '.join(ORDER)}")
 
 
-def literal(method: Inverse) -> Inverse:
+def paper_settings(method: InverseDynamics) -> InverseDynamics:
     """The method to the paper's letter.
 
     h = 1, whole-episode replay (§5.2), λ = 0.25, φ fitted to mean latents (Eq. 6), and Adam
@@ -223,10 +234,13 @@ def literal(method: Inverse) -> Inverse:
     """
     return dataclasses.replace(
         method,
-        name=f"{method.name} literal",
-        look_ahead=1,
+        name=f"{method.name} paper",
+        goal_horizon=1,
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
         fit=dataclasses.replace(
-            method.fit, latent_weight=protocol.LATENT_WEIGHT, averaged=True, decay=False
+            method.fit,
+            latent_loss_weight=protocol.LATENT_WEIGHT,
+            mean_latent=True,
+            cosine_decay=False,
         ),
     )

@@ -15,7 +15,7 @@ from genidm import symmetry
 from genidm.checks import check_value, count
 from genidm.errors import BadInput
 from genidm.experience import Experience, goal_step
-from genidm.paper.replaying import Replay
+from genidm.paper.replaying import RotatedReplay
 from genidm.robots.base import Robot
 
 # Share of a record that is too little to be learned from without a word.
@@ -43,9 +43,9 @@ class Pairs(flax.struct.PyTreeNode):
 def pairs(
     robot: Robot,
     experience: Experience,
-    turned: Replay | None = None,
+    turned: RotatedReplay | None = None,
     *,
-    look_ahead: int = 100,
+    goal_horizon: int = 100,
     mirror: bool = False,
 ) -> Pairs:
     """Samples to fit from: the record, its turned copies, and their reflections.
@@ -54,18 +54,18 @@ def pairs(
       robot: whose layouts say how s and a transform.
       experience: E, `[T, B, ...]`.
       turned: 𝒢(E), or None for the record alone.
-      look_ahead: h, steps to the intermediate goal o'; 1 is the paper's reading. Steps
+      goal_horizon: h, steps to the intermediate goal o'; 1 is the paper's reading. Steps
         whose episode ends before are left out. Where o' lies beyond what was replayed in
         one piece, it is the record's own, turned.
       mirror: adds the reflection y → −y of every sample, in every view.
 
     Raises:
-      BadInput: look_ahead is no whole number from 1 on, or longer than all episodes, or the record
-        is unusable.
+      BadInput: goal_horizon is no whole number from 1 on, or longer than all episodes, or the
+        record is unusable.
     """
-    check_value("look_ahead", look_ahead, count())
+    check_value("goal_horizon", goal_horizon, count())
     experience = experience.prepared(robot)
-    goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.ends), look_ahead))
+    goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.ends), goal_horizon))
     ahead = np.take_along_axis(experience.o_next, goal[..., None], axis=0)
     views = [(experience.s, ahead - experience.o)]
     # A step that is not valid is no goal for others, either.
@@ -75,12 +75,14 @@ def pairs(
         views.append((copy.s, _goal(copy, goal, ahead) - copy.o))
         valid = valid & copy.valid
     if 0 < valid.mean() < FEW:
-        said = f"look_ahead {look_ahead} leaves {valid.sum()} of {valid.size} steps to learn from"
+        said = (
+            f"goal_horizon {goal_horizon} leaves {valid.sum()} of {valid.size} steps to learn from"
+        )
         warnings.warn(f"{said}: the episodes of the others end sooner", stacklevel=2)
     if not exists.any():
         raise BadInput(
-            f"no episode lasts look_ahead = {look_ahead} steps: make it less "
-            "(--method.look-ahead), or collect more (--scale)"
+            f"no episode lasts goal_horizon = {goal_horizon} steps: make it less "
+            "(--method.goal-horizon), or collect more (--scale)"
         )
     out = _samples(views, experience.a, valid)
     return with_reflection(robot, out) if mirror else out
@@ -95,7 +97,7 @@ def _tell_of_gaps(experience: Experience) -> None:
         warnings.warn(said, stacklevel=3)
 
 
-def _copies(turned: Replay | None) -> Iterator[Replay]:
+def _copies(turned: RotatedReplay | None) -> Iterator[RotatedReplay]:
     """The copies of a replay one by one, arrays `[T, B, ...]` on the host."""
     if turned is not None:
         host = jax.tree.map(np.asarray, turned)
@@ -104,10 +106,10 @@ def _copies(turned: Replay | None) -> Iterator[Replay]:
             yield jax.tree.map(lambda x, n=copy: x[n], host.replace(start=start))
 
 
-def _goal(copy: Replay, goal: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+def _goal(copy: RotatedReplay, goal: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """o' `[T, B, 3]` of a copy: replayed where that reaches, else the record's own, turned."""
     replayed = np.take_along_axis(copy.o_next, goal[..., None], axis=0)
-    exact = np.asarray(symmetry.turn_vector(jnp.asarray(ahead), jnp.asarray(copy.yaw)))
+    exact = np.asarray(symmetry.rotate_vector(jnp.asarray(ahead), jnp.asarray(copy.yaw)))
     in_one_piece = np.take_along_axis(copy.start, goal, axis=0) == copy.start
     in_one_piece &= np.take_along_axis(copy.valid, goal, axis=0)
     return np.where(in_one_piece[..., None], replayed, exact)

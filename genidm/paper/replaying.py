@@ -16,12 +16,12 @@ from jax.sharding import Mesh
 
 from genidm import devices, files
 from genidm.experience import Experience
-from genidm.progress import Progress, compiled
+from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
 
 
-class Replay(flax.struct.PyTreeNode):
+class RotatedReplay(flax.struct.PyTreeNode):
     """What 𝒢 saw: C turned copies of a record of T steps of B lanes.
 
     Attributes:
@@ -46,8 +46,8 @@ class Replay(flax.struct.PyTreeNode):
         files.save_arrays(path, tree, {}, overwrite=True)
 
     @classmethod
-    def load(cls, path: Path) -> Replay:
-        """A replay that `save` wrote; raises BadInput if it is torn."""
+    def load(cls, path: Path) -> RotatedReplay:
+        """A replay that `save` wrote; raises BadInput if it is corrupt."""
         return cls(**files.load_arrays(path)[0])
 
 
@@ -163,7 +163,7 @@ class Runner:
         keys, block = example
         cursor = self.start(keys, block)
         sharded = devices.over_lanes(self._replay, mesh, [0, 1], (0, 1))
-        self.program = compiled("generalize", jax.jit(sharded), cursor, self.put(block))
+        self.program = compile_ahead("generalize", jax.jit(sharded), cursor, self.put(block))
 
     def put(self, block: Block) -> Block:
         """A block on the devices."""
@@ -173,7 +173,7 @@ class Runner:
         """A cursor for a block, with keys `[lanes]`; its robots are placed before they step."""
         yaw = jnp.zeros(keys.shape, jnp.float32)
         first = jax.tree.map(lambda x: x[0], block["physics"])
-        shapes = jax.eval_shape(self.robot.place, first, yaw)
+        shapes = jax.eval_shape(self.robot.set_state, first, yaw)
         robots = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return devices.put(Cursor(robots, yaw, yaw == 0, keys), self.mesh)
 
@@ -200,9 +200,9 @@ class Runner:
         placed = row["placed"]
         keys, yaw = _draw_yaw(cursor.keys)
         yaw = jnp.where(placed, yaw, cursor.yaw)
-        on_record = self.robot.place(row["physics"], yaw)
-        # The record knows readings that `place` cannot (contact): turned, they are exact.
-        on_record = on_record.replace(observation=self.robot.observation.turn(row["s"], yaw))
+        on_record = self.robot.set_state(row["physics"], yaw)
+        # The record knows readings that `set_state` cannot (contact): turned, they are exact.
+        on_record = on_record.replace(observation=self.robot.observation.rotate(row["s"], yaw))
         usable = (placed | cursor.valid) & row["valid"]
         return select(placed, on_record, cursor.robots), row["a"], (keys, yaw, usable)
 

@@ -10,16 +10,16 @@ from genidm.report.figures import (
     residuals,
     violins,
 )
-from genidm.report.journeys import journeys
 from genidm.report.rows import Row, origin, results
 from genidm.report.table import markdown, text
+from genidm.report.waypoint_figure import draw_waypoint_runs
 
 __all__ = [
     "TABLE1",
     "Row",
     "bearings",
+    "draw_waypoint_runs",
     "invariance",
-    "journeys",
     "latent_sizes",
     "learning_curves",
     "markdown",

@@ -89,7 +89,7 @@ def write(fig: Figure, path: Target) -> Figure:
     return fig
 
 
-def dress(ax: Axes, xlabel: str, ylabel: str) -> None:
+def style_axes(ax: Axes, xlabel: str, ylabel: str) -> None:
     """Axes with their labels, where there are any, and little else."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=10)

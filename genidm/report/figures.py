@@ -22,7 +22,7 @@ from genidm.report.rows import Row
 Panel = tuple[str, Mapping[str, Sequence[Array]], Array, float]
 
 TARGET_RADIUS = 0.1  # metres; what counts as reached, drawn to scale
-ABREAST = 5  # methods side by side in a figure of ways
+ABREAST = 5  # methods side by side in a figure of trajectories
 BESIDE = 0.2  # of the distance between violins; how far from the middle the means stand
 TARGET_RED = "#D00000"
 CURVE_POINTS = 100  # of a learning curve; what lies between is noise of single iterations
@@ -67,7 +67,7 @@ def violins(
     _start_line(ax, rows)
     ax.set_xticks(range(len(rows)), [row.method for row in rows])
     ax.set_ylim(bottom=0)
-    drawing.dress(ax, "", "closest distance to the target, m")
+    drawing.style_axes(ax, "", "closest distance to the target, m")
     drawing.key(fig, _violin_key(bool(paper)))
     return drawing.write(fig, path)
 
@@ -78,8 +78,8 @@ def paths(panels: Sequence[Panel], path: Target) -> Figure:
     More methods than a page is wide stand in bands below each other.
 
     Args:
-      panels: (title, method → ways, each `[T, 2]` metres, targets `[E, 2]` metres, heading at
-        the start in radians). Every method of a panel has its own axes, equally scaled.
+      panels: (title, method → trajectories, each `[T, 2]` metres, targets `[E, 2]` metres, heading
+        at the start in radians). Every method of a panel has its own axes, equally scaled.
       path: PNG to write.
     """
     methods = list(dict.fromkeys(name for panel in panels for name in panel[1]))
@@ -123,7 +123,7 @@ def learning_curves(
     looks = styles(dict.fromkeys(map(_family, curves)))
     for ax, key in zip(axes, keys, strict=False):
         _curve_panel(ax, curves, key, looks)
-        drawing.dress(ax, steps, METRICS.get(key, key.replace("_", " ")))
+        drawing.style_axes(ax, steps, METRICS.get(key, key.replace("_", " ")))
     for ax in axes[len(keys) :]:
         ax.set_visible(False)
     drawing.line_key(fig, looks)
@@ -147,7 +147,7 @@ def residuals(curves: Mapping[str, Mapping[str, Array]], path: Target) -> Figure
     if any(np.min(curve["median"]) < FLOOR for curve in curves.values()):
         ax.text(1, 1.4 * FLOOR, "exactly 0, or less than the axis shows", fontsize=9)
     ax.set_ylim(bottom=FLOOR / 2)
-    drawing.dress(ax, "steps since placing", "distance to the exact rotation, m")
+    drawing.style_axes(ax, "steps since placing", "distance to the exact rotation, m")
     kinds = [
         Line2D([], [], color="0.25", lw=2.2, label="median"),
         Line2D([], [], color="0.25", lw=0.9, label="90th percentile"),
@@ -177,12 +177,12 @@ def bearings(closest: Mapping[str, Array], bearing: Array, heading: Array, path:
         _bins(right, turned, values, np.linspace(-180, 180, 13), looks[name], shift)
     left.set(xticks=np.arange(-45, 46, 15), ylim=(0, None))
     right.set_xticks(np.arange(-180, 181, 60))
-    drawing.dress(
+    drawing.style_axes(
         left,
         "bearing of the target, degrees (left is positive)",
         "closest distance to the target, m",
     )
-    drawing.dress(right, "heading at the start in the world, degrees", "")
+    drawing.style_axes(right, "heading at the start in the world, degrees", "")
     drawing.line_key(fig, looks)
     return drawing.write(fig, path)
 
@@ -210,7 +210,7 @@ def invariance(changes: Mapping[str, Array], angle: Array, path: Target) -> Figu
     ax.set(ylim=(-0.1 * LINEAR, None), xticks=np.arange(0, 181, 30))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     _name_noise(ax, changes)
-    drawing.dress(ax, "turned by, degrees", "change of the action (Def. 3)")
+    drawing.style_axes(ax, "turned by, degrees", "change of the action (Def. 3)")
     drawing.line_key(fig, looks)
     return drawing.write(fig, path)
 
@@ -245,7 +245,7 @@ def latent_sizes(
     ax.set_xscale("log")
     ax.set(xticks=sizes, xticklabels=[str(k) for k in sizes], ylim=(0, None))
     ax.xaxis.set_minor_locator(NullLocator())
-    drawing.dress(ax, "size k of the latent", "closest distance to the target, m")
+    drawing.style_axes(ax, "size k of the latent", "closest distance to the target, m")
     drawing.key(fig, _size_key(style, several, chosen))
     return drawing.write(fig, path)
 
@@ -294,14 +294,14 @@ def _bands(names: Sequence[str]) -> list[list[str]]:
 
 def _panel(axes: Array, names: Sequence[str], panel: Panel, looks: Mapping[str, Style]) -> None:
     """A row of axes `[columns]`, one a method; those that are left over go."""
-    title, ways, targets, heading = panel
-    walked = itertools.chain(*ways.values())
+    title, trajectories, targets, heading = panel
+    walked = itertools.chain(*trajectories.values())
     limits = _square([np.asarray(targets), *(_near(way, targets) for way in walked)])
     for ax, name in zip(axes, names, strict=False):
         _targets(ax, targets)
-        _ways(ax, ways.get(name, ()), looks[name], heading, limits)
+        _trajectories(ax, trajectories.get(name, ()), looks[name], heading, limits)
         ax.set(xlim=limits[0], ylim=limits[1], aspect="equal")
-        drawing.dress(ax, "", "")
+        drawing.style_axes(ax, "", "")
         ax.grid(False)
     axes[0].set_ylabel(f"{title}\ny, m", fontsize=11)
     for ax in axes[len(names) :]:
@@ -314,22 +314,22 @@ def _targets(ax: Axes, targets: Array) -> None:
         ax.add_patch(disc)
 
 
-def _ways(
+def _trajectories(
     ax: Axes,
-    ways: Sequence[Array],
+    trajectories: Sequence[Array],
     style: Style,
     heading: float,
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
     line = drawing.strokes(style) | {"marker": "", "linestyle": "-", "linewidth": 1.2}
-    for way in map(np.asarray, ways):
+    for way in map(np.asarray, trajectories):
         ax.plot(way[:, 0], way[:, 1], **line)
         ax.plot(*way[-1], marker=style.marker, color=style.colour, mec="black", mew=0.6, ms=5)
-    if len(ways):
+    if len(trajectories):
         length = 0.12 * (limits[0][1] - limits[0][0])
-        tip = ways[0][0] + length * np.array([np.cos(heading), np.sin(heading)])
+        tip = trajectories[0][0] + length * np.array([np.cos(heading), np.sin(heading)])
         arrow = {"arrowstyle": "-|>", "color": "black", "linewidth": 1.8, "shrinkA": 0}
-        ax.annotate("", tip, ways[0][0], arrowprops=arrow, zorder=6)
+        ax.annotate("", tip, trajectories[0][0], arrowprops=arrow, zorder=6)
 
 
 def _near(way: Array, targets: Array) -> Array:

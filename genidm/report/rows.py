@@ -58,7 +58,7 @@ def results(
         paper's method with every other row.
       robot: its name, as in Table 1.
       scale: "quick", "paper" or a number of interactions.
-      scenarios: sha256 of the scenario bank.
+      scenarios: sha256 of the scenarios.
       engine: what stepped the robot; None if it steps itself.
 
     Returns:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from genidm import files
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import Scenarios
 from genidm.paper.methods import ORDER
 from genidm.report.rows import Row, origin
@@ -47,10 +47,10 @@ class Tested:
         return Episodes(**self._tree["episodes"])
 
     @property
-    def ways(self) -> list[np.ndarray]:
-        """Positions `[steps + 1, 3]` in the episodes of the tours (Fig. 8), metres."""
-        ways = self._tree.get("ways", {})
-        return [ways[str(i)] for i in range(len(ways))]
+    def trajectories(self) -> list[np.ndarray]:
+        """Positions `[steps + 1, 3]` in the episodes of Fig. 8, metres."""
+        trajectories = self._tree.get("trajectories", {})
+        return [trajectories[str(i)] for i in range(len(trajectories))]
 
     @property
     def made(self) -> dict[str, dict[str, Any]]:
@@ -73,14 +73,14 @@ class Runs:
     Attributes:
       robot: whose report it is.
       root: where its stages lie.
-      bank: the scenarios of the table.
+      scenarios: the scenarios of the table.
       found: method → its tests, one a training seed, in the order of the rows; the table's
-        own test, on the bank, is the first.
+        own test, on the scenarios, is the first.
     """
 
     robot: Robot
     root: Path
-    bank: Scenarios
+    scenarios: Scenarios
     found: dict[str, list[Tested]]
 
     def row(self, name: str, invariance: float | None = None) -> Row:
@@ -117,37 +117,37 @@ class Runs:
 def find(
     robot: Robot,
     root: Path,
-    bank: Scenarios,
+    scenarios: Scenarios,
     scale: str,
-    settings: Test,
+    settings: EvaluationSettings,
     own: Sequence[Path] = (),
 ) -> Runs:
-    """The tests of every method that was tested on `bank`.
+    """The tests of every method that was tested on some scenarios.
 
     A method's row is its newest test with the lowest training seed; its newest tests with
-    the other seeds, on whatever part of the bank, give the spread. Tests in `own` count as the
+    the other seeds, on whatever part of the scenarios, give the spread. Tests in `own` count as the
     newest.
 
     Args:
       robot: whose they are.
       root: where its stages lie.
-      bank: the scenarios of the table.
+      scenarios: the scenarios of the table.
       scale: the scale that the methods were run at.
       settings: of the test.
       own: directories of the tests that the caller asked for.
     """
     done = _finished(robot, root, scale, settings, own)
-    return Runs(robot, root, bank, _by_method(done, bank.digest()))
+    return Runs(robot, root, scenarios, _by_method(done, scenarios.digest()))
 
 
 def _finished(
-    robot: Robot, root: Path, scale: str, settings: Test, own: Sequence[Path]
+    robot: Robot, root: Path, scale: str, settings: EvaluationSettings, own: Sequence[Path]
 ) -> Iterator[Tested]:
     """All finished tests at a scale, on the robot's engine, oldest first."""
     done = sorted(
         root.glob(f"test-*/{DONE}"), key=lambda path: (path.parent in own, path.stat().st_mtime)
     )
-    asked = (scale, plain(settings), robot.engine_name)
+    asked = (scale, to_json(settings), robot.engine_name)
     for path in done:
         try:
             summary = files.load_json(path)
@@ -161,12 +161,12 @@ def _finished(
 
 
 def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
-    """Method → its newest test of each training seed, the one on the bank first."""
+    """Method → its newest test of each training seed, the one on the scenarios first."""
     newest: dict[str, dict[int, Tested]] = {}
     for test in done:
         seeds = newest.setdefault(test.summary["method"], {})
         kept = seeds.get(test.summary["seed"])
-        # A test on another part of the bank does not stand in for one on the bank.
+        # A test on another part of the scenarios does not stand in for one on the scenarios.
         if not kept or kept.summary["scenarios"] != digest or test.summary["scenarios"] == digest:
             _warn_of_another(kept, test)
             seeds[test.summary["seed"]] = test

@@ -12,7 +12,7 @@ import numpy as np
 from genidm import controller, experience, files, symmetry
 from genidm.evaluation import stats
 from genidm.evaluation.invariance import ANGLES, invariance, probes
-from genidm.evaluation.scenarios import TOUR, UNSEEN_YAW, Scenarios, tours
+from genidm.evaluation.scenarios import FIG8_EPISODES, UNSEEN_YAW, Scenarios, fig8_scenarios
 from genidm.progress import METRICS, read_metrics
 from genidm.report.figures import Panel
 from genidm.report.runs import Runs
@@ -29,7 +29,7 @@ class Shown:
       closest: method → closest distance `[seeds, episodes]`, metres; NaN where it diverged.
       heading, bearing: `[seeds, episodes]`, radians: of the robot at the start, and of the
         target from it.
-      panels: the ways of Fig. 8.
+      panels: the trajectories of Fig. 8.
       collecting: agent → metrics while it collected.
       learning: method → metrics while its agent learned to go to goals.
       fitting: method → metrics of its fit.
@@ -56,7 +56,7 @@ class Shown:
 
 def gather(runs: Runs) -> Shown:
     """All that the figures of a report show."""
-    heading, bearing = _angles(runs.robot, runs.bank)
+    heading, bearing = _angles(runs.robot, runs.scenarios)
     learned = {name: _metrics(tests[0].controller.parent) for name, tests in runs.found.items()}
     return Shown(
         closest={name: stats.masked(tests[0].episodes) for name, tests in runs.found.items()},
@@ -74,16 +74,28 @@ def gather(runs: Runs) -> Shown:
 
 
 def _panels(runs: Runs) -> list[Panel]:
-    """Fig. 8: the ways of each method towards targets seen and unseen while learning."""
-    target = np.asarray(tours(runs.robot).target)
-    ways = {name: [way[:, :2] for way in tests[0].ways] for name, tests in runs.found.items()}
+    """Fig. 8: the trajectories of each method towards targets seen and unseen while learning."""
+    target = np.asarray(fig8_scenarios(runs.robot).target)
+    trajectories = {
+        name: [way[:, :2] for way in tests[0].trajectories] for name, tests in runs.found.items()
+    }
     return [
-        ("as learned", {n: w[:TOUR] for n, w in ways.items()}, target[0, :, :2], 0.0),
-        ("turned 135°", {n: w[TOUR:] for n, w in ways.items()}, target[1, :, :2], UNSEEN_YAW),
+        (
+            "as learned",
+            {n: w[:FIG8_EPISODES] for n, w in trajectories.items()},
+            target[0, :, :2],
+            0.0,
+        ),
+        (
+            "turned 135°",
+            {n: w[FIG8_EPISODES:] for n, w in trajectories.items()},
+            target[1, :, :2],
+            UNSEEN_YAW,
+        ),
     ]
 
 
-def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
+def _angles(robot: Robot, scenarios: Scenarios) -> tuple[np.ndarray, np.ndarray]:
     """Heading at the start, and the target's bearing from it, `[seeds, episodes]`, radians."""
 
     def angles(keys: jax.Array, yaw: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -92,9 +104,9 @@ def _angles(robot: Robot, bank: Scenarios) -> tuple[np.ndarray, np.ndarray]:
         bearing = jax.numpy.arctan2(way[:, 1], way[:, 0]) - state.heading
         return state.heading, symmetry.wrap(bearing)
 
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), bank)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), scenarios)
     out = jax.jit(angles)(flat.keys, flat.yaw, flat.target)
-    heading, bearing = (np.asarray(x).reshape(bank.shape) for x in out)
+    heading, bearing = (np.asarray(x).reshape(scenarios.shape) for x in out)
     return heading, bearing
 
 

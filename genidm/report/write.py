@@ -8,7 +8,7 @@ from typing import Any
 
 from genidm import files
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test
+from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.invariance import ANGLES
 from genidm.evaluation.scenarios import Scenarios
 from genidm.paper.protocol import TABLE1
@@ -23,18 +23,18 @@ from genidm.store import alone
 def report(
     robot: Robot,
     root: Path,
-    bank: Scenarios,
+    scenarios: Scenarios,
     scale: str,
-    settings: Test,
+    settings: EvaluationSettings,
     results: Path | None = None,
     own: Sequence[Path] = (),
 ) -> Path:
-    """Writes the table and the figures of all methods that were tested on `bank`.
+    """Writes the table and the figures of all methods that were tested on some scenarios.
 
     Args:
       robot: whose report it is.
       root: where its stages lie.
-      bank: the scenarios of the table.
+      scenarios: the scenarios of the table.
       scale: the scale that the methods were run at.
       settings: of the test.
       results: also write the table, its numbers and the figures there, under names that begin
@@ -46,9 +46,9 @@ def report(
       the directory of the report.
 
     Raises:
-      BadInput: no method was tested on the bank.
+      BadInput: no method was tested on the scenarios.
     """
-    runs = find(robot, root, bank, scale, settings, own)
+    runs = find(robot, root, scenarios, scale, settings, own)
     if not runs.found:
         raise BadInput(f"no method in {root} has been tested on these scenarios")
     shown = gather(runs)
@@ -66,7 +66,7 @@ def report(
 def _document(runs: Runs, rows: list[Row], scale: str) -> dict[str, Any]:
     return results(
         rows, robot=runs.robot.name, engine=runs.robot.engine, scale=scale,
-        scenarios=runs.bank.digest(),
+        scenarios=runs.scenarios.digest(),
     )  # fmt: skip
 
 

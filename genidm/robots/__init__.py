@@ -71,7 +71,7 @@ def remade(settings: dict[str, Any]) -> Robot:
 
 
 def _like(model: Any, value: Any) -> Any:
-    """What `config.plain` made of a setting, as it was before: a value of the model's kind."""
+    """What `config.to_json` made of a setting, as it was before: a value of the model's kind."""
     if isinstance(model, float):
         return float(value)  # "inf" is a string in JSON
     if not dataclasses.is_dataclass(model):

@@ -33,14 +33,14 @@ class Ant(MujocoRobot):
 
     name = "ant"
     model = ASSETS / "ant.xml"
-    frames = 5
-    control_step = 0.05
+    frame_skip = 5
+    dt = 0.05
     standing_height = 0.55
     target_distance = protocol.TARGET_DISTANCE["ant"]
     healthy_height = (0.2, 1.0)
     paper_interactions = protocol.INTERACTIONS["ant"]
     # gymnasium's weights of the walking reward.
-    alive_bonus = 1.0
+    healthy_reward = 1.0
     control_cost = 0.5
     contact_cost = 5e-4
 
@@ -71,7 +71,7 @@ def clip_wrenches(wrenches: jax.Array) -> jax.Array:
     Def. 3; here the horizontal part of torque and of force is shortened to length 1.
     """
     parts = wrenches.reshape(-1, 2, 3)
-    length = symmetry.horizontal(parts)[..., None]
+    length = symmetry.horizontal_norm(parts)[..., None]
     level = parts[..., :2] / jnp.maximum(length, 1.0)
     upright = jnp.clip(parts[..., 2:], -1.0, 1.0)
     return jnp.concatenate([level, upright], axis=-1).reshape(wrenches.shape)

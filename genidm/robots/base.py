@@ -56,10 +56,10 @@ class Robot(abc.ABC):
       observation: layout of s `[S]`.
       physics: tree of layouts, shaped like `State.physics`.
       action: layout of a `[A]`, in [−1, 1].
-      control_step: seconds a step.
+      dt: seconds a step.
       standing_height: metres; height of the base of a standing robot, and so of targets.
       target_distance: metres, least and greatest, of the paper's test (A.1.3).
-      alive_bonus: reward of a step without a fall.
+      healthy_reward: reward of a step without a fall.
       paper_interactions: steps that the paper collects (A.1.2).
       engines: names of the engines that can step it; none if it steps itself.
       engine: the one that does; None if it steps itself.
@@ -68,10 +68,10 @@ class Robot(abc.ABC):
     """
 
     name: ClassVar[str]
-    control_step: ClassVar[float]
+    dt: ClassVar[float]
     standing_height: ClassVar[float]
     target_distance: ClassVar[tuple[float, float]]
-    alive_bonus: ClassVar[float]
+    healthy_reward: ClassVar[float]
     paper_interactions: ClassVar[int]
     engines: ClassVar[Collection[str]] = ()
     engine: Engine | None = None
@@ -99,7 +99,7 @@ class Robot(abc.ABC):
         """One control step under actions `[B, A]`."""
 
     @abc.abstractmethod
-    def place(self, physics: Any, yaw: jax.Array) -> State:
+    def set_state(self, physics: Any, yaw: jax.Array) -> State:
         """Recorded physics, turned by `yaw [B]` about the vertical through the origin.
 
         Readings that only a step can give (contact forces) are zero until one is made.
@@ -109,32 +109,36 @@ class Robot(abc.ABC):
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         """Control and contact costs `[B]` of the step that led to `state` under `action`."""
 
-    def heard(self, s: jax.Array, displacement: jax.Array) -> jax.Array:
+    def check_inputs(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """s `[..., S]` as its controllers were taught it, with w ≥ 0 in its quaternions.
 
         Args:
           s: of whoever asks for an action.
-          displacement: `[..., 3]`, the way that it asks for.
+          relative_goal: `[..., 3]`, the way that it asks for.
 
         Raises:
           BadInput: their shapes do not fit the robot, or each other; or, outside of jitted
             programs, a number is not finite.
         """
-        state, way = jnp.shape(s), jnp.shape(displacement)
+        state, way = jnp.shape(s), jnp.shape(relative_goal)
         if state[-1:] != (self.observation.size,) or way != (*state[:-1], 3):
             wanted = f"s [..., {self.observation.size}] and a way [..., 3] in metres"
             raise BadInput(f"the {self.name} is told {wanted}, not {state} and {way}")
-        for x, name in ((s, "s"), (displacement, "the way")):
+        for x, name in ((s, "s"), (relative_goal, "the way")):
             if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
                 raise BadInput(f"{name} holds NaN or infinity: nothing steers the {self.name} so")
         return self.observation.canonical(jnp.asarray(s))
 
-    def at_once(self, lanes: int) -> int:
+    def max_parallel_envs(self, lanes: int) -> int:
         """Largest batch to step together for a caller that asks for `lanes`.
 
         For callers whose results do not depend on the number.
         """
-        return self.engine.at_once(lanes) if self.engine else devices.at_once(lanes)
+        return (
+            self.engine.max_parallel_envs(lanes)
+            if self.engine
+            else devices.max_parallel_envs(lanes)
+        )
 
     @property
     def engine_name(self) -> str | None:
@@ -145,30 +149,30 @@ class Robot(abc.ABC):
         """The jax devices that share its lanes, unless the caller names others."""
         return self.engine.mesh() if self.engine else devices.mesh()
 
-    def drawing(self) -> mujoco.MjSpec:
+    def visual_model(self) -> mujoco.MjSpec:
         """A MuJoCo model that shows what the robot looks like, the caller's to change.
 
         It is posed and looked at (`genidm.video`), never stepped; a robot on another engine
-        gives one that has its shape. Floor, lights and sky are the film's.
+        gives one that has its shape. Floor, lights and sky are the video's.
 
         Raises:
           BadInput: nobody has said what the robot looks like.
         """
-        raise BadInput(f"there is nothing to film: the {self.name} has no drawing")
+        raise BadInput(f"there is nothing to render: the {self.name} has no visual model")
 
-    def posture(self, physics: Any) -> np.ndarray:
-        """qpos `[..., nq]` in which the drawing shows `physics [...]`, metres and radians.
+    def visual_qpos(self, physics: Any) -> np.ndarray:
+        """qpos `[..., nq]` in which the visual model shows `physics [...]`, metres and radians.
 
         It is asked on the host, for recorded physics: it need not be traceable.
 
         Raises:
-          BadInput: as for `drawing`.
+          BadInput: as for `visual_model`.
         """
-        raise BadInput(f"there is nothing to film: the {self.name} has no drawing")
+        raise BadInput(f"there is nothing to render: the {self.name} has no visual model")
 
-    def turn_physics(self, physics: Any, yaw: jax.Array) -> Any:
+    def rotate_physics(self, physics: Any, yaw: jax.Array) -> Any:
         """Physics after the world is turned by `yaw [B]`."""
-        return jax.tree.map(lambda layout, x: layout.turn(x, yaw), self.physics, physics)
+        return jax.tree.map(lambda layout, x: layout.rotate(x, yaw), self.physics, physics)
 
     def mirror_physics(self, physics: Any) -> Any:
         """Physics after the reflection y → −y."""

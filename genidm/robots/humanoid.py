@@ -59,14 +59,14 @@ class Humanoid(MujocoRobot):
     name = "humanoid"
     velocity: ClassVar[Frame] = "heading"
     model = ASSETS / "humanoid.xml"
-    frames = 4
-    control_step = 0.0165
+    frame_skip = 4
+    dt = 0.0165
     standing_height = 1.17
     target_distance = protocol.TARGET_DISTANCE["humanoid"]
     healthy_height = (0.78, math.inf)
     paper_interactions = protocol.INTERACTIONS["humanoid"]
     # PyBullet's weights of the walking reward.
-    alive_bonus = 2.0
+    healthy_reward = 2.0
     electricity_cost = 2.0
     torque_cost = 0.1
     limit_cost = 0.1
@@ -114,7 +114,7 @@ class Humanoid(MujocoRobot):
         angles = symmetry.euler_of(physics.qpos[3:7])
         velocity = physics.qvel[:3]
         if self.velocity == "heading":
-            velocity = symmetry.turn_vector(velocity, -angles[2])
+            velocity = symmetry.rotate_vector(velocity, -angles[2])
         place = (physics.qpos[7:] - self._middle) / self._reach
         joints = jnp.stack([place, 0.1 * physics.qvel[6:]], axis=-1).reshape(-1)
         touching = jnp.linalg.norm(contact[self._feet, 3:], axis=-1) > TOUCH
@@ -140,7 +140,7 @@ class HumanoidWorld(Humanoid):
 
 def edited(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Brax's humanoid with PyBullet's motors, limits, time step and base; both sides alike."""
-    spec.option.timestep = Humanoid.control_step / Humanoid.frames
+    spec.option.timestep = Humanoid.dt / Humanoid.frame_skip
     for side in ("right", "left"):
         spec.joint(f"{side}_hip_y").range = HIP_RANGE
         spec.joint(f"{side}_hip_y").armature = HIP_ARMATURE

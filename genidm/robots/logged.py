@@ -13,13 +13,13 @@ from genidm.robots.base import Robot, State
 class Logged(Robot):
     """What turns logs into a controller without a simulator.
 
-    A subclass names itself and its `control_step` and `standing_height`, and says how the
+    A subclass names itself and its `dt` and `standing_height`, and says how the
     numbers of s and of a transform (`observation`, `action`). Its logs can be turned
     (`Generalize(mode="rotate")`) and fitted; what would step it is refused.
     """
 
     target_distance = (2.0, 5.0)
-    alive_bonus = 0.0
+    healthy_reward = 0.0
     paper_interactions = 0
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
@@ -28,7 +28,7 @@ class Logged(Robot):
     def step(self, state: State, action: jax.Array) -> State:
         raise self._refusal()
 
-    def place(self, physics: Any, yaw: jax.Array) -> State:
+    def set_state(self, physics: Any, yaw: jax.Array) -> State:
         raise self._refusal()
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:

@@ -120,13 +120,13 @@ class Minitaur(Robot):
     """
 
     name = "minitaur"
-    control_step = world.SUBSTEP * world.SUBSTEPS
+    dt = world.SUBSTEP * world.SUBSTEPS
     standing_height = 0.2
     target_distance = protocol.TARGET_DISTANCE["minitaur"]
     paper_interactions = protocol.INTERACTIONS["minitaur"]
     # pybullet_envs has none. With a horizon of a second (discount 0.99), a lunge at 1 m/s that
     # ends in a fall would else be worth more than any walk.
-    alive_bonus = 0.5
+    healthy_reward = 0.5
     # Of the base's start, m/s and rad/s; pybullet_envs has none, and starts that are all alike.
     reset_noise = 0.1
 
@@ -165,7 +165,7 @@ class Minitaur(Robot):
         """The settled start, `[...]` of one robot, at yaw 0."""
         return from_rows(jnp.asarray(self.engine.pool.greeting()))
 
-    def drawing(self) -> mujoco.MjSpec:
+    def visual_model(self) -> mujoco.MjSpec:
         """PyBullet's own model, as MuJoCo reads it: its boxes and cylinders."""
         import pybullet_data
 
@@ -174,15 +174,15 @@ class Minitaur(Robot):
         spec.bodies[1].add_freejoint()
         return spec
 
-    def posture(self, physics: Physics) -> np.ndarray:
+    def visual_qpos(self, physics: Physics) -> np.ndarray:
         pose = np.asarray(physics.pose)
         angles = pose[..., 7:] * np.tile(world.DIRECTION, 2)
         return np.concatenate([pose[..., :7], angles[..., self._drawn]], axis=-1)
 
     @functools.cached_property
     def _drawn(self) -> list[int]:
-        """For each hinge of the drawing, which of our joints it is."""
-        model, names = self.drawing().compile(), world.MOTORS + world.KNEES
+        """For each hinge of the visual model, which of our joints it is."""
+        model, names = self.visual_model().compile(), world.MOTORS + world.KNEES
         return [names.index(model.joint(i).name) for i in range(1, model.njnt)]
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
@@ -193,10 +193,10 @@ class Minitaur(Robot):
         still = jnp.broadcast_to(rest.motion, (*keys.shape, MOTION.size))
         moving = still.at[:, :6].add(self.reset_noise * push)
         alike = jax.tree.map(lambda x: jnp.broadcast_to(x, (*keys.shape, *x.shape)), rest)
-        return self.place(alike.replace(motion=moving), yaw)
+        return self.set_state(alike.replace(motion=moving), yaw)
 
-    def place(self, physics: Physics, yaw: jax.Array) -> State:
-        state = self._state(self.turn_physics(physics, yaw))
+    def set_state(self, physics: Physics, yaw: jax.Array) -> State:
+        state = self._state(self.rotate_physics(physics, yaw))
         # A start is not judged.
         return state.replace(fallen=jnp.zeros_like(state.fallen))
 
@@ -231,13 +231,13 @@ class Minitaur(Robot):
         """What pybullet_envs charges for energy, a second."""
         torque = MOTORS.part(state.physics.motors, "torque")
         rate = MOTION.part(state.physics.motion, "motor velocities")
-        return world.charge(torque, rate) / self.control_step
+        return world.charge(torque, rate) / self.dt
 
 
 def from_rows(rows: jax.Array) -> Physics:
     """Physics of rows `[..., 61]`; quaternions with w ≥ 0."""
     pose, motion, motors = jnp.split(rows, [POSE.size, POSE.size + MOTION.size], axis=-1)
-    upright = symmetry.positive(pose[..., 3:7])
+    upright = symmetry.canonical_quaternion(pose[..., 3:7])
     return Physics(pose.at[..., 3:7].set(upright), motion, motors)
 
 

@@ -19,7 +19,7 @@ from genidm.robots.minitaur_world import ACTIONS, Simulation, Solver, charge, ha
 class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One Minitaur that is rewarded for walking towards +x, as in pybullet_envs.
 
-    The reward of a step is Δx − 0.005 |τ·q̇| dt, dt being one physics step; the episode
+    The reward of a step is Δx − 0.005 |τ·q̇| Δt, Δt being one physics step; the episode
     ends with a fall, and has no time limit (`gymnasium.wrappers.TimeLimit`). Observations
     and actions are those of `genidm.robots.Minitaur`, and so is the motion, but for the
     contacts that Bullet keeps from one step to the next: nothing is placed anew here.
@@ -50,7 +50,7 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         options = options or {}
         self.simulation.reset(options.get("yaw", 0.0))
         if "row" in options:
-            self.simulation.place(options["row"])
+            self.simulation.set_state(options["row"])
         return self._observe(parts(self.simulation.read())), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

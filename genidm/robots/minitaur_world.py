@@ -139,7 +139,7 @@ def has_fallen(orientation: Any, height: Any) -> Any:
 def charge(torque: Any, rate: Any) -> Any:
     """What a control step is charged for energy `[...]`, in the reward's metres.
 
-    0.005 |τ·q̇| dt, where dt is one physics step of the five, the last, as in pybullet_envs.
+    0.005 |τ·q̇| Δt, where Δt is one physics step of the five, the last, as in pybullet_envs.
 
     Args:
       torque: `[..., 8]`, as observed, N·m.
@@ -183,7 +183,7 @@ class Client:
 class Simulation:
     """A Minitaur on a plane; it goes on from where it is, as simulations do.
 
-    It starts anew by `reset`, which loads everything afresh, or by `place`, in any state.
+    It starts anew by `reset`, which loads everything afresh, or by `set_state`, in any state.
 
     Args:
       solver: settings of Bullet.
@@ -257,7 +257,7 @@ class Simulation:
             self.body, self.motors + self.knees, q[:, None].tolist(), v[:, None].tolist()
         )
 
-    def place(self, row: np.ndarray) -> None:
+    def set_state(self, row: np.ndarray) -> None:
         """Puts the robot into the state that `row [61]` says.
 
         What follows depends on the row alone, to the last bit: Bullet keeps contacts from one
@@ -343,7 +343,7 @@ def serve(solver: Solver, patience: float) -> None:
 
 def stepped(simulation: Simulation, row: np.ndarray) -> np.ndarray:
     """State `[61]` one control step after the state and action in `row [69]`."""
-    simulation.place(row[:WIDTH])
+    simulation.set_state(row[:WIDTH])
     simulation.step(row[WIDTH:].astype(np.float64))
     after = simulation.read()
     if not (np.abs(after) < ABSURD).all():

@@ -105,7 +105,7 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
 class MujocoRobot(Robot):
     """A robot with a free base on hinges, stepped by an engine of `genidm.engines.ENGINES`.
 
-    A subclass sets `name`, `model`, `frames`, `control_step`, `standing_height` and
+    A subclass sets `name`, `model`, `frame_skip`, `dt`, `standing_height` and
     `healthy_height`; docs/extending.md shows one. It overrides the rest where it differs.
 
     By default s is gymnasium's without x and y: height, quaternion (w ≥ 0), joint angles,
@@ -117,23 +117,23 @@ class MujocoRobot(Robot):
 
     Attributes:
       model: the MJCF file.
-      frames: physics steps a control step.
+      frame_skip: physics steps a control step.
       healthy_height: metres, least and greatest height of the base; outside, the robot has fallen.
       control_cost: cost of a step, times the sum of the squared actions.
       reset_noise: of a start: ± m, ± rad; m/s, rad/s (standard deviation).
 
     Raises:
       ValueError: the model has no free base, has joints that are no hinges, is not its own mirror
-        image, or its time step does not fit `control_step`.
+        image, or its time step does not fit `dt`.
     """
 
     engines = ENGINES.keys()
     engine: Engine
     model: ClassVar[PathLike[str] | str]
-    frames: ClassVar[int]
+    frame_skip: ClassVar[int]
     healthy_height: ClassVar[tuple[float, float]]
     target_distance = (2.0, 5.0)
-    alive_bonus = 1.0
+    healthy_reward = 1.0
     paper_interactions = 2_000_000
     control_cost: float = 0.5
     reset_noise: float = 0.1
@@ -142,9 +142,9 @@ class MujocoRobot(Robot):
         solver = solver or Solver()
         self._spec = self._specify(solver)
         self.mj_model = self._spec.compile()
-        _fitting(self.mj_model, self.frames, self.control_step)
+        _fitting(self.mj_model, self.frame_skip, self.dt)
         chosen = engines.choose(engine, self.engines, self.name)
-        self.engine = engines.of_model(chosen, self._spec, self.frames)
+        self.engine = engines.of_model(chosen, self._spec, self.frame_skip)
         self.settings = {"name": self.name, "engine": self.engine.name, "solver": solver}
         self._rest = self.rest_pose()
         self.mirror = mirror_of(self.mj_model)
@@ -185,15 +185,15 @@ class MujocoRobot(Robot):
         motion = (symmetry.vector("velocity", "m/s"), symmetry.body_pseudovector("spin"), rates)
         return Physics(Layout(pose), Layout(motion), Layout(motion))
 
-    def drawing(self) -> mujoco.MjSpec:
+    def visual_model(self) -> mujoco.MjSpec:
         return self._spec.copy()
 
-    def posture(self, physics: Physics) -> np.ndarray:
+    def visual_qpos(self, physics: Physics) -> np.ndarray:
         return np.asarray(physics.qpos)
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
         physics = jax.vmap(self._draw)(keys)
-        return self.place(physics, yaw)
+        return self.set_state(physics, yaw)
 
     def _draw(self, key: jax.Array) -> Physics:
         """gymnasium's start: the rest pose, uniform noise in qpos, Gaussian in qvel."""
@@ -207,9 +207,9 @@ class MujocoRobot(Robot):
         qvel = noise * jax.random.normal(motion, (nv,), jnp.float32)
         return Physics(qpos, qvel, jnp.zeros(nv, jnp.float32))
 
-    def place(self, physics: Physics, yaw: jax.Array) -> State:
+    def set_state(self, physics: Physics, yaw: jax.Array) -> State:
         contact = jnp.zeros((*yaw.shape, self.mj_model.nbody, 6), physics.qpos.dtype)
-        state = jax.vmap(self._state)(self.turn_physics(physics, yaw), contact)
+        state = jax.vmap(self._state)(self.rotate_physics(physics, yaw), contact)
         # A start is not judged: noise may lift a robot out of its healthy height.
         return state.replace(fallen=jnp.zeros_like(state.fallen))
 
@@ -239,18 +239,18 @@ class MujocoRobot(Robot):
 
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:
         """s `[S]` of one robot from its physics and contact wrenches `[nbody, 6]`."""
-        qpos = physics.qpos.at[3:7].set(symmetry.positive(physics.qpos[3:7]))
+        qpos = physics.qpos.at[3:7].set(symmetry.canonical_quaternion(physics.qpos[3:7]))
         return jnp.concatenate([qpos[2:], physics.qvel])
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:
         return self.control_cost * jnp.sum(action**2, axis=-1)
 
 
-def _fitting(model: mujoco.MjModel, frames: int, control_step: float) -> None:
+def _fitting(model: mujoco.MjModel, frame_skip: int, dt: float) -> None:
     """Refuses a model that `Physics` does not describe, or that is stepped at another rate."""
     free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
     if [*model.jnt_type[:1]] != [free] or not (model.jnt_type[1:] == hinge).all():
         raise ValueError("the model is to have a free joint first, and hinges after it")
-    made = frames * model.opt.timestep
-    if not math.isclose(made, control_step, rel_tol=1e-6):
-        raise ValueError(f"{frames} time steps of the model are {made:g} s, not {control_step:g} s")
+    made = frame_skip * model.opt.timestep
+    if not math.isclose(made, dt, rel_tol=1e-6):
+        raise ValueError(f"{frame_skip} time steps of the model are {made:g} s, not {dt:g} s")

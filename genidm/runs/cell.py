@@ -10,63 +10,66 @@ from typing import Any
 from genidm import controller, devices, files
 from genidm.checks import shown
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Steering
+from genidm.evaluation.evaluate import ControllerFn
 from genidm.evaluation.scenarios import Scenarios, scenarios
-from genidm.paper.methods import Direct, Inverse
+from genidm.paper.methods import GoalConditioned, InverseDynamics
 from genidm.robots import Robot, by_name
 from genidm.runs.resolve import Options, resolve, who_set_what
-from genidm.runs.run import Cell, DirectCell, InverseCell
+from genidm.runs.run import GoalConditionedRun, InverseDynamicsRun, Run
 from genidm.runs.scale import scale_of
 from genidm.store import Stage
 
 
-def cell(robot: Robot, method: Direct | Inverse, options: Options) -> Cell[Any]:
+def make_run(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Run[Any]:
     """The cell of a method as scale and machine have it (`resolve`)."""
     chosen = resolve(robot, method, options)
-    return cell_of(robot, chosen, options, who_set_what(method, chosen, chosen))
+    return make_exact_run(robot, chosen, options, who_set_what(method, chosen, chosen))
 
 
-def cell_of(
-    robot: Robot, method: Direct | Inverse, options: Options, notes: tuple[str, ...] = ()
-) -> Cell[Any]:
+def make_exact_run(
+    robot: Robot,
+    method: GoalConditioned | InverseDynamics,
+    options: Options,
+    notes: tuple[str, ...] = (),
+) -> Run[Any]:
     """The cell of a method exactly as it is given; `notes` say who set what."""
     if options.video:
-        robot.drawing()  # what cannot be filmed is said before anything is computed
-    for directory in (options.out, options.results):
+        robot.visual_model()  # what cannot be rendered is said before anything is computed
+    for directory in (options.run_dir, options.report_dir):
         if directory is not None:
             files.check_writable(directory, directory=True)
     given: dict[str, Any] = dict(
         robot=robot, scale=scale_of(options.scale, robot.paper_interactions), seed=options.seed,
-        root=options.out / robot.name, test=options.test,
+        root=options.run_dir / robot.name, test=options.test,
         notes=notes, other_code=options.other_code,
     )  # fmt: skip
-    kind: Any = DirectCell if isinstance(method, Direct) else InverseCell
+    kind: Any = GoalConditionedRun if isinstance(method, GoalConditioned) else InverseDynamicsRun
     return kind(method=method, **given)
 
 
-def run_cell(robot: Robot, method: Direct | Inverse, options: Options) -> Path:
+def run_method(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Path:
     """Runs the cell of a method, as scale and machine have it, and writes the report.
 
     Returns:
       the directory of the report of all cells beside it.
     """
-    return run_to_the_end(cell(robot, method, options), options)
+    return execute(make_run(robot, method, options), options)
 
 
-def run_to_the_end(this: Cell[Any], options: Options) -> Path:
+def execute(this: Run[Any], options: Options) -> Path:
     """Runs a cell and writes the report of all cells beside it: its directory is returned."""
     announce(this.robot, options.engine)
     say(this.notes)
-    tested = bank_of(this, options)
-    stage = this.episodes(tested)
+    tested = scenarios_of(this, options)
+    stage = this.run_test(tested)
     if options.video:
-        film_cell(this)
+        render_run(this)
     return write_report(this, tested, options, [stage])
 
 
 def saved(
     runs: Sequence[Path], engine: str | None = None
-) -> tuple[Robot, dict[str, tuple[Steering, dict[str, Any]]]]:
+) -> tuple[Robot, dict[str, tuple[ControllerFn, dict[str, Any]]]]:
     """Controllers to be compared, from the directories of their runs.
 
     Args:
@@ -81,14 +84,16 @@ def saved(
       BadInput: there are none, one is no finished run, or they are of different robots.
     """
     if not runs:
-        raise BadInput("give the directory of a run: METHOD-SEED-… under --out of a cell")
+        raise BadInput("give the directory of a run: METHOD-SEED-… under --run-dir of a cell")
     robots: dict[str, Robot] = {}
-    models: dict[str, tuple[Steering, dict[str, Any]]] = {}
+    models: dict[str, tuple[ControllerFn, dict[str, Any]]] = {}
     for run in runs:
         stage = Stage(run)
         summary = stage.summary()
         if not isinstance(summary, dict) or not {"robot", "method"} <= summary.keys():
-            raise BadInput(f"{run} is no run of a controller: METHOD-SEED-… under --out of a cell")
+            raise BadInput(
+                f"{run} is no run of a controller: METHOD-SEED-… under --run-dir of a cell"
+            )
         kind, name = str(summary["robot"]), shown(summary["method"])
         robots.setdefault(kind, by_name(kind, engine))
         model = stage.read(controller.load, ".", robots[kind])
@@ -100,15 +105,15 @@ def saved(
     return robot, models
 
 
-def film_cell(this: Cell[Any]) -> None:
-    """Films a cell's test, beside its controller.
+def render_run(this: Run[Any]) -> None:
+    """Renders a cell's test, beside its controller.
 
     `video.html` and, where a picture can be drawn, `video.gif`.
     """
     from genidm import video  # nor is this
 
     stage = this.controller_stage
-    made = video.film_run(stage.directory, robot=this.robot)
+    made = video.render_run(stage.directory, robot=this.robot)
     video.write(made, stage.path("video.html"))
     try:
         video.write(made, stage.path("video.gif"))
@@ -117,20 +122,20 @@ def film_cell(this: Cell[Any]) -> None:
     print(f"Video in {stage.directory}", file=sys.stderr)
 
 
-def bank_of(this: Cell[Any], options: Options) -> Scenarios:
+def scenarios_of(this: Run[Any], options: Options) -> Scenarios:
     """The scenarios that a cell is tested on, as its scale or the user says."""
     episodes = this.scale.episodes if options.episodes is None else options.episodes
     return scenarios(this.robot, this.scale.seeds, episodes)
 
 
 def write_report(
-    this: Cell[Any], bank: Scenarios, options: Options, own: Iterable[Stage] = ()
+    this: Run[Any], test_scenarios: Scenarios, options: Options, own: Iterable[Stage] = ()
 ) -> Path:
-    """The report of all cells that lie beside one, and were tested on `bank`.
+    """The report of all cells that lie beside one, and were tested on some scenarios.
 
     Args:
       this: a cell of the report.
-      bank: the scenarios of the table.
+      test_scenarios: the scenarios of the table.
       options: scale, test, places.
       own: tests that this command asked for: they are its rows, also where there are newer
         tests of methods with the same names.
@@ -141,7 +146,7 @@ def write_report(
     from genidm.report.write import report  # drawing is not needed before the end
 
     return report(
-        this.robot, this.root, bank, this.scale.name, options.test, options.results,
+        this.robot, this.root, test_scenarios, this.scale.name, options.test, options.report_dir,
         own=[stage.directory for stage in own],
     )  # fmt: skip
 

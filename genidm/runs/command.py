@@ -16,13 +16,14 @@ import tyro
 from genidm import devices
 from genidm.checkpoints import requested_seconds
 from genidm.errors import BadInput, sentence
-from genidm.paper.methods import Direct, Inverse
+from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.renamed import refuse
 from genidm.robots import Robot
-from genidm.runs.cell import cell_of, run_to_the_end
+from genidm.runs.cell import execute, make_exact_run
 from genidm.runs.resolve import Options, resolve, who_set_what
 
 
-def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
+def main(robot: Callable[..., Robot], method: GoalConditioned | InverseDynamics) -> None:
     """The command line of a cell: `python -m experiments.ant_lr`.
 
     The flags are read twice. The first time scale and engine; what they choose is what the flags
@@ -37,8 +38,8 @@ def main(robot: Callable[..., Robot], method: Direct | Inverse) -> None:
         made = robot(**({} if early.engine is None else {"engine": early.engine}))
         chosen = resolve(made, method, early)
         options, given = _parse(_settings(chosen), description)
-        this = cell_of(made, given, options, who_set_what(method, chosen, given))
-        report = run_to_the_end(this, options)
+        this = make_exact_run(made, given, options, who_set_what(method, chosen, given))
+        report = execute(this, options)
         print((report / "table.txt").read_text(encoding="utf-8"))
 
 
@@ -46,19 +47,21 @@ def _early(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> O
     return options
 
 
-def _settings(method: Direct | Inverse) -> Callable[..., tuple[Options, Direct | Inverse]]:
+def _settings(
+    method: GoalConditioned | InverseDynamics,
+) -> Callable[..., tuple[Options, GoalConditioned | InverseDynamics]]:
     """A function whose parameters are the flags of a cell."""
 
     def both(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
-        method: Direct | Inverse = method,
-    ) -> tuple[Options, Direct | Inverse]:
+        method: GoalConditioned | InverseDynamics = method,
+    ) -> tuple[Options, GoalConditioned | InverseDynamics]:
         return options, method
 
     return both
 
 
-def guarded(command: Callable[..., None], description: str) -> None:
+def run_cli(command: Callable[..., None], description: str) -> None:
     """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr."""
     with in_sentences():
         _parse(command, description)
@@ -66,6 +69,7 @@ def guarded(command: Callable[..., None], description: str) -> None:
 
 def _parse(command: Callable[..., Any], description: str, **how: Any) -> Any:
     """Calls a function with what the command line says."""
+    refuse(command, sys.argv[1:])
     return tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,), **how)
 
 

@@ -11,10 +11,10 @@ from genidm.agents.frozen import Frozen
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.checks import check, count, optional
-from genidm.config import flat, plain
+from genidm.config import flat, to_json
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Test
-from genidm.paper.methods import Direct, Inverse, literal
+from genidm.evaluation.evaluate import EvaluationSettings
+from genidm.paper.methods import GoalConditioned, InverseDynamics, paper_settings
 from genidm.robots import Robot
 from genidm.runs.scale import Scale, scale_of
 
@@ -29,12 +29,12 @@ class Options:
       seed: training seed: of the experience, the replay and the fit. The test's are fixed.
       engine: what steps the robot: "mjx", or "mujoco" for MuJoCo in C; MJX on an accelerator
         and MuJoCo in C on a CPU, unless given. The Minitaur has "bullet" alone.
-      out: where runs are kept. The same command again goes on where it was.
-      literal: the paper's letter instead of our settings: h = 1, whole-episode replay,
+      run_dir: where runs are kept. The same command again goes on where it was.
+      paper_settings: the paper's letter instead of our settings: h = 1, whole-episode replay,
         λ = 0.25, mean latents, constant learning rate.
       episodes: test episodes a seed; as the scale says, unless given.
-      results: also write the table and the figures to this directory.
-      video: also film three episodes of the test: a page and a gif, beside the controller.
+      report_dir: also write the table and the figures to this directory.
+      video: also render three episodes of the test: a page and a gif, beside the controller.
       other_code: take finished stages that other code made, and say so. Off, they are made anew.
       test: the test (A.1.3).
     """
@@ -42,20 +42,22 @@ class Options:
     scale: str = "paper"
     seed: int = 0
     engine: str | None = None
-    out: Path = Path("runs")
-    literal: bool = False
+    run_dir: Path = Path("runs")
+    paper_settings: bool = False
     episodes: int | None = None
-    results: Path | None = None
+    report_dir: Path | None = None
     video: bool = False
     other_code: bool = False
-    test: Test = dataclasses.field(default_factory=Test)
+    test: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
 
     def __post_init__(self) -> None:
         # A seed has 32 bits: jax would take 2³² for 0.
         check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
 
 
-def resolve(robot: Robot, method: Direct | Inverse, options: Options) -> Direct | Inverse:
+def resolve(
+    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
+) -> GoalConditioned | InverseDynamics:
     """A method as the scale, the machine and the robot's engine have it.
 
     On the command line this is what the flags of a method start from, so that what the user
@@ -65,39 +67,45 @@ def resolve(robot: Robot, method: Direct | Inverse, options: Options) -> Direct 
       BadInput: the scale is none, or the paper has no other settings for the method.
     """
     scale = scale_of(options.scale, robot.paper_interactions)
-    if isinstance(method.agent, PPO) and method.agent == PPO(hidden=method.agent.hidden):
-        agent = dataclasses.replace(scale.ppo, hidden=method.agent.hidden)
+    if isinstance(method.agent, PPO) and method.agent == PPO(
+        policy_hidden_layer_sizes=method.agent.policy_hidden_layer_sizes
+    ):
+        agent = dataclasses.replace(
+            scale.ppo, policy_hidden_layer_sizes=method.agent.policy_hidden_layer_sizes
+        )
         method = dataclasses.replace(method, agent=agent)
     if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
-        wide: Any = method.agent.wide()  # of the method's own type
+        wide: Any = method.agent.for_accelerator()  # of the method's own type
         method = dataclasses.replace(method, agent=wide)
-    if isinstance(method, Direct):
-        if options.literal:
+    if isinstance(method, GoalConditioned):
+        if options.paper_settings:
             raise BadInput(f"{method.name} has no settings that the paper's letter would change")
         return method
-    method = _fitting(literal(method) if options.literal else method, scale)
+    method = _fitting(paper_settings(method) if options.paper_settings else method, scale)
     if method.generalize:
         method = dataclasses.replace(method, generalize=method.generalize.on(robot))
     return method
 
 
-def _fitting(method: Inverse, scale: Scale) -> Inverse:
+def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
     """The method as far as a scale's record is long enough for it."""
     agent = method.agent
     if isinstance(agent, Frozen):
-        agent = dataclasses.replace(agent, share=max(agent.share, scale.learning))
+        agent = dataclasses.replace(agent, fraction=max(agent.fraction, scale.learning))
     updates = max(1, round(method.fit.updates * scale.updates))
     return dataclasses.replace(
         method,
         agent=agent,
-        look_ahead=min(method.look_ahead, scale.look_ahead),
-        share=max(method.share, scale.share),
+        goal_horizon=min(method.goal_horizon, scale.goal_horizon),
+        fraction=max(method.fraction, scale.fraction),
         fit=dataclasses.replace(method.fit, updates=updates),
     )
 
 
 def who_set_what(
-    method: Direct | Inverse, chosen: Direct | Inverse, given: Direct | Inverse
+    method: GoalConditioned | InverseDynamics,
+    chosen: GoalConditioned | InverseDynamics,
+    given: GoalConditioned | InverseDynamics,
 ) -> tuple[str, ...]:
     """Which settings are not those of the method, who set them, and which are not the paper's.
 
@@ -109,12 +117,16 @@ def who_set_what(
     Returns:
       a line each for what is chosen, what the user set, and what differs from the paper.
     """
-    papers = literal(method) if isinstance(method, Inverse) and given.name == method.name else given
+    papers = (
+        paper_settings(method)
+        if isinstance(method, InverseDynamics) and given.name == method.name
+        else given
+    )
     lines = []
     for who, before, after in (
         ("chosen for this scale and machine", method, chosen),
         ("set by you", chosen, given),
-        ("not the paper's (--literal has those)", papers, given),
+        ("not the paper's (--paper-settings has those)", papers, given),
     ):
         changes = [c for c in differences(before, after) if not c.startswith("name ")]
         if changes:
@@ -124,7 +136,7 @@ def who_set_what(
 
 def differences(before: Any, after: Any) -> list[str]:
     """Settings that differ, as "name value (value before)"."""
-    was, now = (flat(plain(x)) for x in (before, after))
+    was, now = (flat(to_json(x)) for x in (before, after))
     return [
         f"{name} {now.get(name, 'absent')} ({was.get(name, 'absent')})"
         for name in sorted(was.keys() | now.keys())

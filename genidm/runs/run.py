@@ -1,7 +1,7 @@
 """The stages of a cell of Table 1, each skipped when it is done.
 
-    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        Inverse methods
-                                              policy ──────▶ test        Direct methods
+    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        InverseDynamics methods
+                                              policy ──────▶ test        GoalConditioned methods
 
 Every stage has a directory that the settings it depends on name, so methods that agree
 on a stage share it, and a run that was killed goes on where it was.
@@ -24,18 +24,18 @@ from genidm.agents.base import Agent
 from genidm.agents.collect import collect, whole
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.policy import Policy
-from genidm.config import plain
+from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.evaluation import sanity
 from genidm.evaluation.episodes import Episodes
-from genidm.evaluation.evaluate import Steering, Test, episodes, flatten, run
-from genidm.evaluation.scenarios import Scenarios, tours
+from genidm.evaluation.evaluate import ControllerFn, EvaluationSettings, episodes, flatten, run
+from genidm.evaluation.scenarios import Scenarios, fig8_scenarios
 from genidm.experience import Experience
 from genidm.paper.fit import fit
 from genidm.paper.generalize import replay, residual
-from genidm.paper.methods import Direct, Inverse, Method
+from genidm.paper.methods import GoalConditioned, InverseDynamics, Method
 from genidm.paper.pairs import pairs
-from genidm.paper.replaying import Replay
+from genidm.paper.replaying import RotatedReplay
 from genidm.provenance import code_of
 from genidm.robots import Robot, State
 from genidm.runs.scale import Scale
@@ -43,26 +43,26 @@ from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
 
-# Episodes of the test that can be filmed as they went.
-FILMED = 3
+# Episodes of the test that can be rendered as they went.
+RECORDED_EPISODES = 3
 # What makes a record, beside the agent.
 COLLECT = "genidm.agents.collect"
 
 
 class Trace(NamedTuple):
-    """What is kept of states `[B]`, so that an episode can be drawn and filmed."""
+    """What is kept of states `[B]`, so that an episode can be drawn and rendered."""
 
-    way: jax.Array
+    position: jax.Array
     physics: Any
 
 
-def way_and_physics(state: State) -> Trace:
+def position_and_physics(state: State) -> Trace:
     """Keeps o and the physics."""
     return Trace(state.position, state.physics)
 
 
 @dataclasses.dataclass(frozen=True)
-class Cell(abc.ABC, Generic[M]):
+class Run(abc.ABC, Generic[M]):
     """One method on one robot, with one seed: its stages.
 
     Attributes:
@@ -81,7 +81,7 @@ class Cell(abc.ABC, Generic[M]):
     scale: Scale
     seed: int
     root: Path
-    test: Test
+    test: EvaluationSettings
     notes: tuple[str, ...] = ()
     other_code: bool = False
 
@@ -91,7 +91,7 @@ class Cell(abc.ABC, Generic[M]):
         """Where the controller lies, once it is made."""
 
     @abc.abstractmethod
-    def controller(self) -> Steering:
+    def controller(self) -> ControllerFn:
         """What steers the robot in the test; made, unless it is there."""
 
     @property
@@ -136,61 +136,66 @@ class Cell(abc.ABC, Generic[M]):
         )
         return record, agent.policy(self.robot, task, learner)
 
-    def test_stage(self, bank: Scenarios, kind: str = "test") -> Stage:
-        """Where the test on a bank lies.
+    def test_stage(self, scenarios: Scenarios, kind: str = "test") -> Stage:
+        """Where the test on a scenarios lies.
 
         Args:
-          bank: the scenarios.
+          scenarios: the scenarios.
           kind: first word of the stage's name. The report shows all of kind "test"; those
             of another kind are no rows of its table.
         """
         source = self.controller_stage.directory.name
-        config = {"fit": source, "bank": bank.digest(), "test": self.test}
+        config = {"fit": source, "scenarios": scenarios.digest(), "test": self.test}
         code = ("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.controller")
         return self._stage(f"{kind}-{self._label}", config, *code)
 
-    def episodes(self, bank: Scenarios, kind: str = "test") -> Stage:
-        """The test (A.1.3), and the ways of Fig. 8; returns `test_stage`, finished."""
-        stage = self.test_stage(bank, kind)
-        stage.once(lambda: self._tested(stage, bank))
+    def run_test(self, scenarios: Scenarios, kind: str = "test") -> Stage:
+        """The test (A.1.3), and the trajectories of Fig. 8; returns `test_stage`, finished."""
+        stage = self.test_stage(scenarios, kind)
+        stage.run_once(lambda: self._tested(stage, scenarios))
         return stage
 
-    def _tested(self, stage: Stage, bank: Scenarios) -> dict[str, Any]:
-        model, walks = self.controller(), tours(self.robot)
+    def _tested(self, stage: Stage, scenarios: Scenarios) -> dict[str, Any]:
+        model, walks = self.controller(), fig8_scenarios(self.robot)
         shown = walks.yaw.size
         outcome, traces = run(
-            self.robot, model, flatten(walks, bank), self.test,
-            traced=shown + min(FILMED, bank.shape[1]), watch=way_and_physics, stage=stage,
-        )  # fmt: skip
+            self.robot,
+            model,
+            flatten(walks, scenarios),
+            self.test,
+            traced=shown + min(RECORDED_EPISODES, scenarios.shape[1]),
+            record=position_and_physics,
+            stage=stage,
+        )
         rest = jax.tree.map(lambda x: np.asarray(x)[shown:], outcome)
-        ways = [trace.way for trace in traces[:shown]]
-        recordings = self._recordings(traces[shown:], bank.target[0])
-        outcomes = episodes(rest, bank.shape)
-        save_test(stage, outcomes, ways, recordings)
+        trajectories = [trace.position for trace in traces[:shown]]
+        recordings = self._recordings(traces[shown:], scenarios.target[0])
+        outcomes = episodes(rest, scenarios.shape)
+        save_test(stage, outcomes, trajectories, recordings)
         return (
             self.controller_stage.summary()
             | sanity.walked(self.method.name, outcomes)
-            | sanity.heeds(self.method.name, ways, np.asarray(walks.target))
-            | {"seed": self.seed, "scale": self.scale.name, "scenarios": bank.digest()}
+            | sanity.heeds(self.method.name, trajectories, np.asarray(walks.target))
+            | {"seed": self.seed, "scale": self.scale.name, "scenarios": scenarios.digest()}
             | {"engine": self.robot.engine_name}
-            | {"test": plain(self.test), "fit": self.controller_stage.directory.name}
+            | {"test": to_json(self.test), "fit": self.controller_stage.directory.name}
             | {"stages": [source.directory.name for source in self.sources], "run": self.config}
         )
 
     def _recordings(self, traces: list[Trace], target: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Episodes as `genidm.video` films them; none of a robot without a drawing."""
+        """Episodes as `genidm.video` renders them; none of a robot without a visual model."""
         try:
-            poses = [self.robot.posture(trace.physics) for trace in traces]
+            poses = [self.robot.visual_qpos(trace.physics) for trace in traces]
         except BadInput:
             return []
         return [
-            {"qpos": qpos, "position": np.asarray(trace.way), "target": np.asarray(at)}
+            {"qpos": qpos, "position": np.asarray(trace.position), "target": np.asarray(at)}
             for qpos, trace, at in zip(poses, traces, target, strict=False)
         ]
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseCell(Cell[Inverse]):
+class InverseDynamicsRun(Run[InverseDynamics]):
     """A method that fits an inverse dynamics model to experience.
 
     Attributes:
@@ -209,7 +214,7 @@ class InverseCell(Cell[Inverse]):
     def experience(self) -> Experience:
         """What the agent saw while it learned (§4.1)."""
         stage, made = self.experience_stage, list[Experience]()
-        stage.once(lambda: self._collected(made))
+        stage.run_once(lambda: self._collected(made))
         if made:
             return made[0]
         recorded = stage.summary()["recorded"]
@@ -236,7 +241,7 @@ class InverseCell(Cell[Inverse]):
 
     def _before(self, frozen: Frozen) -> int:
         """Interactions after which an agent is frozen."""
-        return whole(frozen.agent, round(frozen.share * self.scale.interactions))
+        return whole(frozen.agent, round(frozen.fraction * self.scale.interactions))
 
     def _collector(self) -> tuple[Agent, int]:
         """What collects, and for how many interactions it has learned before."""
@@ -252,7 +257,7 @@ class InverseCell(Cell[Inverse]):
             policy.save(stage.path("policy"), overwrite=True)
             return {"interactions": interactions}
 
-        stage.once(work)
+        stage.run_once(work)
         learned = stage.read(controller.load, "policy", self.robot)
         assert isinstance(learned, Policy)
         return Acting(frozen.agent, learned), interactions
@@ -264,11 +269,11 @@ class InverseCell(Cell[Inverse]):
         if m.generalize is None:
             return None
         source = self.experience_stage.directory.name
-        config = {"experience": source, "share": m.share, "generalize": m.generalize}
+        config = {"experience": source, "share": m.fraction, "generalize": m.generalize}
         name = f"replay-{m.generalize.mode}-{self.seed}"
         return self._stage(name, config, "genidm.paper.generalize")
 
-    def replay(self, record: Experience) -> Replay | None:
+    def replay(self, record: Experience) -> RotatedReplay | None:
         """𝒢(E) (Def. 4) of the part of the record that the method learns from."""
         stage = self.replay_stage
         if stage is None:
@@ -280,8 +285,8 @@ class InverseCell(Cell[Inverse]):
             files.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
             return {"replayed": turned.yaw.size}
 
-        stage.once(work)
-        return stage.read(Replay.load, "replay")
+        stage.run_once(work)
+        return stage.read(RotatedReplay.load, "replay")
 
     @functools.cached_property
     def controller_stage(self) -> Stage:
@@ -305,19 +310,21 @@ class InverseCell(Cell[Inverse]):
         key = self._key(2)
         return jax.random.fold_in(key, self.repeat) if self.repeat else key
 
-    def controller(self) -> Steering:
+    def controller(self) -> ControllerFn:
         """The fitted models."""
         stage = self.controller_stage
-        stage.once(self._fitted)
+        stage.run_once(self._fitted)
         return stage.read(controller.load, "controller", self.robot)
 
     def _fitted(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
-        record = self.experience().first_share(m.share)
+        record = self.experience().first_fraction(m.fraction)
         samples = pairs(
-            self.robot, record, self.replay(record), look_ahead=m.look_ahead, mirror=m.mirror
+            self.robot, record, self.replay(record), goal_horizon=m.goal_horizon, mirror=m.mirror
         )
-        model = fit(self.robot, samples, self._fit_key, m.fit, frame=m.frame, stage=stage)
+        model = fit(
+            self.robot, samples, self._fit_key, m.fit, input_frame=m.input_frame, stage=stage
+        )
         model.save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,
@@ -326,7 +333,7 @@ class InverseCell(Cell[Inverse]):
             "interactions": self._count(self.experience_stage, "interactions"),
             "learned_from": record.interactions,
             "replayed": self._count(self.replay_stage, "replayed"),
-            "settings": plain(m),
+            "settings": to_json(m),
         }
 
     def _count(self, stage: Stage | None, what: str) -> int:
@@ -334,7 +341,7 @@ class InverseCell(Cell[Inverse]):
 
 
 @dataclasses.dataclass(frozen=True)
-class DirectCell(Cell[Direct]):
+class GoalConditionedRun(Run[GoalConditioned]):
     """A method whose agent learns to go to goals, and whose policy is the controller."""
 
     @functools.cached_property
@@ -346,16 +353,16 @@ class DirectCell(Cell[Direct]):
     def sources(self) -> list[Stage]:
         return [self.controller_stage]
 
-    def controller(self) -> Steering:
+    def controller(self) -> ControllerFn:
         """The policy that the agent ended with."""
         stage = self.controller_stage
-        stage.once(self._learned)
+        stage.run_once(self._learned)
         return stage.read(controller.load, "controller", self.robot)
 
     def _learned(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
         _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
-        assert policy  # no Direct method has an agent that learns nothing
+        assert policy  # no GoalConditioned method has an agent that learns nothing
         policy.save(stage.path("controller"), overwrite=True)
         interactions = whole(m.agent, self.scale.interactions)
         return {
@@ -364,14 +371,14 @@ class DirectCell(Cell[Direct]):
             "interactions": interactions,
             "learned_from": interactions,
             "replayed": 0,
-            "settings": plain(m),
+            "settings": to_json(m),
         }
 
 
 def save_test(
     stage: Stage,
     outcome: Episodes,
-    ways: list[np.ndarray],
+    trajectories: list[np.ndarray],
     recordings: Sequence[dict[str, np.ndarray]] = (),
 ) -> None:
     """Writes a test.
@@ -379,13 +386,13 @@ def save_test(
     Args:
       stage: whose it is.
       outcome: of its episodes.
-      ways: of its tours (Fig. 8), `[steps + 1, 3]` each, metres.
-      recordings: of its first episodes: qpos `[steps + 1, nq]` of the robot's drawing, position
-        `[steps + 1, 3]` and target `[3]`, metres.
+      trajectories: of the episodes of Fig. 8, `[steps + 1, 3]` each, metres.
+      recordings: of its first episodes: qpos `[steps + 1, nq]` of the robot's visual model,
+        position `[steps + 1, 3]` and target `[3]`, metres.
     """
     tree = {
         "episodes": dataclasses.asdict(outcome),
-        "ways": {str(i): w for i, w in enumerate(ways)},
+        "trajectories": {str(i): w for i, w in enumerate(trajectories)},
         "recordings": {str(i): recording for i, recording in enumerate(recordings)},
     }
     files.save_arrays(stage.path("episodes"), tree, {}, overwrite=True)

@@ -22,9 +22,9 @@ class Scale:
       updates: share of a method's updates that are made.
       seeds: test seeds.
       episodes: test episodes a seed.
-      look_ahead: most steps to the intermediate goal. Agents that have just begun to learn
+      goal_horizon: most steps to the intermediate goal. Agents that have just begun to learn
         (`YOUNG`) fall so soon that few of their episodes reach further.
-      share: least part of the record that is learned from: in the first half of a short one
+      fraction: least part of the record that is learned from: in the first half of a short one
         the agent hardly walks.
       learning: least part of the interactions in which an agent that is frozen afterwards
         learns: with few of them it needs most to learn to walk at all.
@@ -37,8 +37,8 @@ class Scale:
     updates: float
     seeds: int
     episodes: int
-    look_ahead: int = 1000
-    share: float = 0.0
+    goal_horizon: int = 1000
+    fraction: float = 0.0
     learning: float = 0.0
     ppo: PPO = dataclasses.field(default_factory=PPO)
 
@@ -56,9 +56,9 @@ def scale_of(text: str, interactions: int) -> Scale:
     if text == "paper":
         return Scale("paper", interactions, 1.0, protocol.TEST_SEEDS, protocol.TEST_EPISODES)
     if text == "quick":
-        hurried = PPO(discount=0.97, learning_rate=1e-3, entropy=0.0)
+        hurried = PPO(discounting=0.97, learning_rate=1e-3, entropy_cost=0.0)
         return Scale(
-            "quick", 400_000, 0.1, 2, 50, look_ahead=50, share=1.0, learning=2 / 3, ppo=hurried
+            "quick", 400_000, 0.1, 2, 50, goal_horizon=50, fraction=1.0, learning=2 / 3, ppo=hurried
         )
     try:
         share = float(text)
@@ -73,6 +73,6 @@ def scale_of(text: str, interactions: int) -> Scale:
         updates=min(share, 1.0),
         seeds=protocol.TEST_SEEDS,
         episodes=max(10, round(protocol.TEST_EPISODES * min(share, 1.0))),
-        look_ahead=1000 if interactions > YOUNG else 50,
+        goal_horizon=1000 if interactions > YOUNG else 50,
         learning=2 / 3 if share < 1 else 0.0,
     )

@@ -1,4 +1,4 @@
-"""A film as one page: what the robot is made of, its poses as numbers, and a viewer.
+"""A video as one page: what the robot is made of, its poses as numbers, and a viewer.
 
 The page is whole: it asks nothing of a network, of a GPU, or of the machine that made it.
 """
@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from genidm.video.filming import Film, Take
+from genidm.video.clips import Clip, Video
 from genidm.video.scenery import size
 
 FPS = 20.0
@@ -29,36 +29,36 @@ class Page(str):
 
     def _repr_html_(self) -> str:
         return (
-            f'<iframe srcdoc="{html.escape(self)}" sandbox="allow-scripts" title="a film" '
+            f'<iframe srcdoc="{html.escape(self)}" sandbox="allow-scripts" title="a video" '
             f'style="width: 100%; height: {HEIGHT}px; border: 0; border-radius: 8px"></iframe>'
         )
 
 
-def page(film: Film) -> Page:
-    """The film as a page that can be turned, zoomed and played."""
+def page(video: Video) -> Page:
+    """The video as a page that can be turned, zoomed and played."""
     viewer = importlib.resources.files("genidm.video").joinpath("viewer.html").read_text("utf-8")
-    data = json.dumps(contents(film), separators=(",", ":"), allow_nan=False)
+    data = json.dumps(contents(video), separators=(",", ":"), allow_nan=False)
     # A script ends at the first "</script", wherever that stands.
     return Page(viewer.replace("FILM", data.replace("<", "\\u003c"), 1))
 
 
-def contents(film: Film) -> dict[str, Any]:
+def contents(video: Video) -> dict[str, Any]:
     """What the page is given.
 
-    `fps` frames a second, `size` of the robot (m), `reach` (m), the `geoms` that the robot is
-    made of, each in the frame of a body, and the `takes`. A take's `frames` are rows of whole
+    `fps` frames a second, `size` of the robot (m), `goal_radius` (m), the `geoms` that the robot is
+    made of, each in the frame of a body, and the `takes`. A clip's `frames` are rows of whole
     numbers: the base's x, y, z (mm), then for each body x, y, z (mm) and quaternion (1e-4).
     """
-    model, start = film.drawing.compile(), film.takes[0].qpos[0]
+    model, start = video.visual_model.compile(), video.clips[0].qpos[0]
     shown = _shown(model)
     bodies = sorted({int(model.geom_bodyid[i]) for i in shown})
     return {
-        "title": film.title,
+        "title": video.title,
         "fps": FPS,
-        "reach": film.reach,
+        "reach": video.goal_radius,
         "size": round(size(model, start), 3),
         "geoms": [_geom(model, i, colour, bodies) for i, colour in shown.items()],
-        "takes": [_take(model, bodies, take) for take in film.takes],
+        "takes": [_clip(model, bodies, clip) for clip in video.clips],
     }
 
 
@@ -95,28 +95,28 @@ def _geom(
     }
 
 
-def _take(model: mujoco.MjModel, bodies: list[int], take: Take) -> dict[str, Any]:
+def _clip(model: mujoco.MjModel, bodies: list[int], clip: Clip) -> dict[str, Any]:
     data = mujoco.MjData(model)
-    seconds = np.minimum(np.arange(np.ceil(take.seconds * FPS - 1e-6) + 1) / FPS, take.seconds)
+    seconds = np.minimum(np.arange(np.ceil(clip.seconds * FPS - 1e-6) + 1) / FPS, clip.seconds)
     rows = []
-    for middle, pose in zip(take.place(seconds), take.at(model, seconds), strict=True):
+    for middle, pose in zip(clip.place(seconds), clip.at(model, seconds), strict=True):
         data.qpos = pose
         mujoco.mj_kinematics(model, data)
         placed = np.c_[PLACE * data.xpos[bodies], TURN * data.xquat[bodies]]
         rows.append(np.round([*(PLACE * middle), *placed.reshape(-1)]).astype(int).tolist())
     return {
-        "seconds": round(take.seconds, 4),
-        "outcome": outcome(take),
-        "waypoints": np.round(take.waypoints, 3).tolist(),
-        "arrivals": [round(t, 3) if np.isfinite(t) else None for t in take.arrivals.tolist()],
+        "seconds": round(clip.seconds, 4),
+        "outcome": outcome(clip),
+        "waypoints": np.round(clip.waypoints, 3).tolist(),
+        "arrivals": [round(t, 3) if np.isfinite(t) else None for t in clip.arrivals.tolist()],
         "frames": rows,
     }
 
 
-def outcome(take: Take) -> str:
+def outcome(clip: Clip) -> str:
     """What became of a journey, in a few words."""
-    reached, count = int((take.arrival >= 0).sum()), len(take.arrival)
+    reached, count = int((clip.arrival >= 0).sum()), len(clip.arrival)
     if reached == count:
-        return f"there in {take.seconds:.1f} s"
+        return f"there in {clip.seconds:.1f} s"
     way = f"{reached} of {count}, " if count > 1 else ""
-    return f"{way}fell after {take.seconds:.1f} s" if take.fell else f"{way}{take.seconds:.1f} s"
+    return f"{way}fell after {clip.seconds:.1f} s" if clip.fell else f"{way}{clip.seconds:.1f} s"

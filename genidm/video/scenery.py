@@ -1,4 +1,4 @@
-"""Where films are shot: a floor with squares of one metre, light, and colours that tell apart."""
+"""Where videos are made: a floor with squares of one metre, light, and colours that tell apart."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ FLOOR = ((0.80, 0.82, 0.85), (0.72, 0.745, 0.78))
 FLOOR_NAME = "genidm floor"
 
 
-def scene(drawing: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
-    """A robot's drawing on the film's floor, in its light.
+def scene(visual_model: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
+    """A robot's visual model on the video's floor, in its light.
 
     Args:
-      drawing: of the robot; its own floor and lights are left out.
+      visual_model: of the robot; its own floor and lights are left out.
       width: pixels of the greatest picture.
       height: pixels.
     """
-    spec = drawing.copy()
+    spec = visual_model.copy()
     # Else the floor, which nothing collides with, would be left out of what comes from a URDF.
     spec.compiler.discardvisual = False
     planes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]

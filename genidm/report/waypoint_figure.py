@@ -1,4 +1,4 @@
-"""Fig. 7: ways through waypoints, and how the body lies along them."""
+"""Fig. 7: trajectories through waypoints, and how the body lies along them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from genidm.evaluation.waypoints import Journeys
+from genidm.evaluation.waypoints import WaypointRuns
 from genidm.report import drawing
 from genidm.report.drawing import Style, Target, styles
 
@@ -17,12 +17,14 @@ ARROW = 0.6  # metres; the length of an arrow that shows where the body points
 EVERY = 1.0  # seconds from one arrow to the next
 
 
-def journeys(by_method: Mapping[str, Journeys], reach: float, path: Target) -> Figure:
-    """All ways from above, one column a method; below, how far they are from the path.
+def draw_waypoint_runs(
+    by_method: Mapping[str, WaypointRuns], goal_radius: float, path: Target
+) -> Figure:
+    """All trajectories from above, one column a method; below, how far they are from the path.
 
     Args:
-      by_method: method → its journeys, all through the same waypoints.
-      reach: metres; waypoints are drawn as discs of this radius.
+      by_method: method → its runs, all through the same waypoints.
+      goal_radius: metres; waypoints are drawn as discs of this radius.
       path: PNG to write.
     """
     columns = len(by_method)
@@ -32,26 +34,26 @@ def journeys(by_method: Mapping[str, Journeys], reach: float, path: Target) -> F
     )
     looks = styles(by_method)
     for (above, below), (name, made) in zip(grid.T, by_method.items(), strict=True):
-        _above(above, made, looks[name], reach)
+        _above(above, made, looks[name], goal_radius)
         _apart(below, made, looks[name])
         above.set_title(name, fontsize=12)
-        drawing.dress(above, "x, m", "")
-        drawing.dress(below, "time, s", "")
+        drawing.style_axes(above, "x, m", "")
+        drawing.style_axes(below, "time, s", "")
     grid[0, 0].set_ylabel("y, m", fontsize=11)
     grid[1, 0].set_ylabel("distance from\nthe path, m", fontsize=11)
     return drawing.write(fig, path)
 
 
-def _above(ax: Axes, made: Journeys, style: Style, reach: float) -> None:
+def _above(ax: Axes, made: WaypointRuns, style: Style, goal_radius: float) -> None:
     """Ways, waypoints in their order, and the body of the first journey's robot."""
     corners = np.concatenate([made.position[0, :1, :2], made.waypoints[0, :, :2]])
     ax.plot(*corners.T, color="0.6", linestyle=":", linewidth=1.2, zorder=1)
     for number, (x, y) in enumerate(corners[1:], 1):
-        ax.add_patch(Circle((x, y), reach, facecolor="none", edgecolor="black", zorder=3))
+        ax.add_patch(Circle((x, y), goal_radius, facecolor="none", edgecolor="black", zorder=3))
         ax.annotate(str(number), (x, y), (6, 6), textcoords="offset points", fontsize=10, zorder=6)
     for way, steps in zip(made.position, made.steps, strict=True):
         ax.plot(*way[: steps + 1, :2].T, color=style.colour, linewidth=1.0, alpha=0.7, zorder=2)
-    stride = max(1, round(EVERY / made.control_step))
+    stride = max(1, round(EVERY / made.dt))
     shown = np.arange(0, made.steps[0] + 1, stride)
     points, angles = made.position[0, shown, :2], made.heading[0, shown]
     ax.quiver(
@@ -61,9 +63,9 @@ def _above(ax: Axes, made: Journeys, style: Style, reach: float) -> None:
     ax.set_aspect("equal")
 
 
-def _apart(ax: Axes, made: Journeys, style: Style) -> None:
-    seconds = made.control_step * np.arange(made.position.shape[1])
-    for row in made.deviation:
+def _apart(ax: Axes, made: WaypointRuns, style: Style) -> None:
+    seconds = made.dt * np.arange(made.position.shape[1])
+    for row in made.cross_track_error:
         ax.plot(seconds, row, color=style.colour, linewidth=0.8, alpha=0.5)
     arrived = made.times[np.isfinite(made.times).all(1)]
     for time in arrived.mean(0) if len(arrived) else ():

@@ -1,4 +1,4 @@
-"""Pictures of a film, by MuJoCo's renderer."""
+"""Pictures of a video, by MuJoCo's renderer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from genidm.checks import check, count, number
 from genidm.progress import Progress
 from genidm.video.backends import renderer
-from genidm.video.filming import Film, Take, between
+from genidm.video.clips import Clip, Video, between
 from genidm.video.scenery import REACHED, RGBA, SUN, SUN_AWAY, TO_GO, TRAIL, scene, size
 
 # The camera: metres away in sizes of the robot, degrees, seconds that its moves are smoothed over.
@@ -33,8 +33,8 @@ MOST_MARKS = 4000
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
-    """How a film is shot.
+class RenderSettings:
+    """How a video is rendered.
 
     Attributes:
       width, height: pixels.
@@ -54,52 +54,57 @@ class Shot:
         check(self, width=size, height=size, fps=number(0.01, 1000), hold=number(0, 3600))
 
 
-def frames(film: Film, shot: Shot, quiet: bool = False) -> Iterator[np.ndarray]:
-    """The pictures `[height, width, 3]` of every take, one after another, as uint8.
+def frames(video: Video, settings: RenderSettings, quiet: bool = False) -> Iterator[np.ndarray]:
+    """The pictures `[height, width, 3]` of every clip, one after another, as uint8.
 
     Raises:
       BadInput: there is nothing to draw with.
     """
-    model = scene(film.drawing, shot.width, shot.height)
-    cues = [times(take, shot) for take in film.takes]
+    model = scene(video.visual_model, settings.width, settings.height)
+    cues = [times(clip, settings) for clip in video.clips]
     with (
         Progress("pictures", sum(map(len, cues)), "pictures", quiet=quiet) as bar,
-        renderer(model, shot.width, shot.height, MOST_MARKS + model.ngeom) as eye,
+        renderer(model, settings.width, settings.height, MOST_MARKS + model.ngeom) as eye,
     ):
-        for number, (take, seconds) in enumerate(zip(film.takes, cues, strict=True), 1):
-            words = f"{film.title}   {number} of {len(cues)}" if len(cues) > 1 else film.title
-            for picture, now in zip(_take(eye, film, take, seconds), seconds, strict=True):
-                yield _captioned(picture, words, _gauge(take, now)) if shot.caption else picture
+        for number, (clip, seconds) in enumerate(zip(video.clips, cues, strict=True), 1):
+            words = f"{video.title}   {number} of {len(cues)}" if len(cues) > 1 else video.title
+            for picture, now in zip(_clip(eye, video, clip, seconds), seconds, strict=True):
+                yield _captioned(picture, words, _gauge(clip, now)) if settings.caption else picture
                 bar.advance(1)
 
 
-def times(take: Take, shot: Shot) -> np.ndarray:
+def times(clip: Clip, settings: RenderSettings) -> np.ndarray:
     """Seconds since the start that are shown, the end for a while."""
-    moving = np.arange(0, take.seconds, 1 / shot.fps)
-    return np.append(moving, [take.seconds] * (1 + round(shot.hold * shot.fps)))
+    moving = np.arange(0, clip.seconds, 1 / settings.fps)
+    return np.append(moving, [clip.seconds] * (1 + round(settings.hold * settings.fps)))
 
 
 def mark(
-    scene: mujoco.MjvScene, take: Take, left: np.ndarray, now: float, reach: float, size: float
+    scene: mujoco.MjvScene,
+    clip: Clip,
+    left: np.ndarray,
+    now: float,
+    goal_radius: float,
+    size: float,
 ) -> None:
     """Adds what stands beside the robot: its waypoints, and its way so far.
 
     Args:
       scene: what is added to.
-      take: the journey.
+      clip: the journey.
       left: `[W]` bool, which waypoints are not reached yet.
       now: seconds since the start.
-      reach: metres.
+      goal_radius: metres.
       size: of the robot, metres.
     """
     kinds = mujoco.mjtGeom
-    for point, to_go in zip(take.waypoints, left, strict=True):
+    for point, to_go in zip(clip.waypoints, left, strict=True):
         colour = TO_GO if to_go else REACHED
         foot, top = point * (1, 1, 0), point + np.array([0, 0, HOVER * size])
         add(scene, kinds.mjGEOM_SPHERE, (BALL * size,) * 3, top, colour)
-        add(scene, kinds.mjGEOM_CYLINDER, (reach, 0.004, 0.0), foot, (*colour[:3], 0.4))
+        add(scene, kinds.mjGEOM_CYLINDER, (goal_radius, 0.004, 0.0), foot, (*colour[:3], 0.4))
         add_line(scene, foot, top, LINE / 2, colour)
-    for a, b in itertools.pairwise(_way(take, now)):
+    for a, b in itertools.pairwise(_way(clip, now)):
         add_line(scene, a, b, LINE, TRAIL)
 
 
@@ -123,35 +128,35 @@ def add_line(
     mujoco.mjv_connector(add(scene, kind, (radius,) * 3, a, colour), kind, radius, a, b)
 
 
-def _take(
-    eye: mujoco.Renderer, film: Film, take: Take, seconds: np.ndarray
+def _clip(
+    eye: mujoco.Renderer, video: Video, clip: Clip, seconds: np.ndarray
 ) -> Iterator[np.ndarray]:
-    data, poses = mujoco.MjData(eye.model), take.at(eye.model, seconds)
+    data, poses = mujoco.MjData(eye.model), clip.at(eye.model, seconds)
     metres = size(eye.model, poses[0])
-    cameras = _cameras(take, seconds, metres)
-    for pose, left, now, camera in zip(poses, take.left(seconds), seconds, cameras, strict=True):
+    cameras = _cameras(clip, seconds, metres)
+    for pose, left, now, camera in zip(poses, clip.left(seconds), seconds, cameras, strict=True):
         data.qpos = pose
         mujoco.mj_forward(eye.model, data)
         data.light_xpos[:] = camera.lookat - SUN_AWAY * np.asarray(SUN)
         eye.update_scene(data, camera)
-        mark(eye.scene, take, left, now, film.reach, metres)
+        mark(eye.scene, clip, left, now, video.goal_radius, metres)
         yield eye.render()
 
 
-def _way(take: Take, now: float) -> np.ndarray:
+def _way(clip: Clip, now: float) -> np.ndarray:
     """The way up to a time `[n, 3]`, on the floor, in pieces of a length that can be seen."""
-    made = take.position[take.times <= now + 1e-6] * (1, 1, 0) + (0, 0, LINE)
+    made = clip.position[clip.times <= now + 1e-6] * (1, 1, 0) + (0, 0, LINE)
     length = np.cumsum(np.linalg.norm(np.diff(made, axis=0, prepend=made[:1]), axis=1))
     return made[np.unique(length // PIECE, return_index=True)[1]]
 
 
-def _cameras(take: Take, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
+def _cameras(clip: Clip, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
     """Behind the robot and to its side, so that where it goes is in the picture."""
-    ahead = take.goal(take.times)[:, :2] - take.position[:, :2]
+    ahead = clip.goal(clip.times)[:, :2] - clip.position[:, :2]
     turn = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    calm = np.c_[_calm(take.position, CALM_PLACE, take), _calm(turn, CALM_TURN, take)]
+    calm = np.c_[_calm(clip.position, CALM_PLACE, clip), _calm(turn, CALM_TURN, clip)]
     cameras = []
-    for *place, azimuth in between(calm, take.times, seconds):
+    for *place, azimuth in between(calm, clip.times, seconds):
         camera = mujoco.MjvCamera()
         camera.azimuth, camera.elevation = np.degrees(azimuth) + ASIDE, DOWN
         camera.distance, camera.lookat = AWAY * size, place
@@ -159,15 +164,15 @@ def _cameras(take: Take, seconds: np.ndarray, size: float) -> list[mujoco.MjvCam
     return cameras
 
 
-def _calm(x: np.ndarray, sigma: float, take: Take) -> np.ndarray:
+def _calm(x: np.ndarray, sigma: float, clip: Clip) -> np.ndarray:
     """`x [t, …]` smoothed over `sigma` seconds; beyond its ends it stays as it is."""
-    return gaussian_filter1d(x, sigma / take.control_step, axis=0, mode="nearest")
+    return gaussian_filter1d(x, sigma / clip.dt, axis=0, mode="nearest")
 
 
-def _gauge(take: Take, now: float) -> str:
+def _gauge(clip: Clip, now: float) -> str:
     """Time, and the distance to the next waypoint."""
     at = np.array([now])
-    apart = np.linalg.norm((take.goal(at) - take.place(at))[0, :2])
+    apart = np.linalg.norm((clip.goal(at) - clip.place(at))[0, :2])
     return f"{now:.1f} s   {apart:.2f} m"
 
 

@@ -13,9 +13,9 @@ from bits import close, is_key, same
 from point import Point
 
 from genidm import devices
-from genidm.agents.walking import walk
+from genidm.agents.unroll import generate_unroll
 from genidm.experience import Experience
-from genidm.tasks import GoToGoal, Lanes, Step, Task, WalkForward
+from genidm.tasks import EnvState, GoToGoal, Task, Transition, WalkForward
 
 # It falls often, so that lanes end several episodes within one walk.
 ROBOT = Point(speed=4.0, falls_at=1.2)
@@ -23,7 +23,7 @@ SHORT = Point(speed=4.0, falls_at=0.35)
 LANES, STEPS = 24, 40
 TASKS: dict[str, Task] = {
     "forward": WalkForward(episode_steps=15),
-    "goal": GoToGoal(episode_steps=15, reach=0.5),
+    "goal": GoToGoal(episode_steps=15, goal_radius=0.5),
 }
 each = pytest.mark.parametrize("name", TASKS)
 
@@ -36,17 +36,19 @@ def choose(x: jax.Array, drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
     return drawn, x
 
 
-def keep(step: Step, fed: jax.Array) -> tuple[Step, jax.Array]:
+def keep(step: Transition, fed: jax.Array) -> tuple[Transition, jax.Array]:
     return step, fed
 
 
-def start(task: Task, robot: Point = ROBOT) -> Lanes:
+def start(task: Task, robot: Point = ROBOT) -> EnvState:
     return jax.jit(functools.partial(task.start, robot))(jax.random.split(jax.random.key(0), LANES))
 
 
 @functools.cache
-def walked(name: str, robot: Point = ROBOT) -> tuple[Lanes, Experience, Any, dict[str, Any]]:
-    program = jax.jit(functools.partial(walk, robot, TASKS[name], STEPS, draw, choose, keep))
+def walked(name: str, robot: Point = ROBOT) -> tuple[EnvState, Experience, Any, dict[str, Any]]:
+    program = jax.jit(
+        functools.partial(generate_unroll, robot, TASKS[name], STEPS, draw, choose, keep)
+    )
     return jax.tree.map(
         lambda x: x if is_key(x) else np.asarray(x), program(start(TASKS[name], robot))
     )
@@ -61,8 +63,10 @@ def test_a_lane_goes_on_from_where_it_was_or_starts_afresh(name: str) -> None:
     np.testing.assert_array_equal(
         step.before.physics.position[1:][going], step.after.physics.position[:-1][going]
     )
-    np.testing.assert_array_equal(step.age[1:][going], step.age[:-1][going] + 1)
-    assert (step.age[1:][ended] == 0).all() and (record.first == (step.age == 0)).all()
+    np.testing.assert_array_equal(step.episode_step[1:][going], step.episode_step[:-1][going] + 1)
+    assert (step.episode_step[1:][ended] == 0).all() and (
+        record.first == (step.episode_step == 0)
+    ).all()
     # Fresh starts lie near the origin, where no robot was that had gone on.
     assert np.linalg.norm(step.before.position[1:][ended][:, :2], axis=-1).max() < 0.15
     same(
@@ -77,9 +81,9 @@ def test_the_robot_makes_the_steps_that_are_recorded(name: str) -> None:
     flat = jax.tree.map(lambda x: jnp.asarray(x).reshape(-1, *x.shape[2:]), step)
     after = jax.jit(ROBOT.step)(flat.before, flat.action)
     close(after.position, flat.after.position, atol=1e-6)
-    keys = jax.random.split(jax.random.key(0), len(flat.age))
-    lanes = Lanes(flat.before, flat.age, keys, flat.goal)
-    anew = TASKS[name].judge(ROBOT, lanes, flat.action, flat.after)
+    keys = jax.random.split(jax.random.key(0), len(flat.episode_step))
+    lanes = EnvState(flat.before, flat.episode_step, keys, flat.goal)
+    anew = TASKS[name].transition(ROBOT, lanes, flat.action, flat.after)
     close(anew.reward, flat.reward, atol=1e-5)
     assert (np.asarray(anew.last) == np.asarray(flat.last)).all()
     np.testing.assert_array_equal(record.a, step.action)
@@ -103,7 +107,7 @@ def test_lanes_walk_alike_however_they_are_shared_out(name: str) -> None:
 
     def on(count: int) -> Any:
         mesh = devices.mesh(jax.devices()[:count])
-        body = functools.partial(walk, ROBOT, task, STEPS, draw, choose, keep)
+        body = functools.partial(generate_unroll, ROBOT, task, STEPS, draw, choose, keep)
         program = jax.jit(devices.over_lanes(body, mesh, [0], (0, 1, 1, 1)))
         return program(devices.put(start(task), mesh))
 

@@ -1,4 +1,4 @@
-"""A film: journeys of one robot, with the pose that it was in at every step."""
+"""A video: journeys of one robot, with the pose that it was in at every step."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from genidm import checks, controller
+from genidm import checks
 from genidm.checks import check_value, count
+from genidm.controller import load as load_controller
 from genidm.errors import BadInput
-from genidm.evaluation.evaluate import Steering, Test
+from genidm.evaluation.evaluate import ControllerFn, EvaluationSettings
 from genidm.evaluation.scenarios import scenarios
-from genidm.evaluation.waypoints import Follow, Journeys, follow
-from genidm.files import MANIFEST, Torn, load_arrays, load_json
+from genidm.evaluation.waypoints import WaypointRuns, WaypointSettings, follow_waypoints
+from genidm.files import MANIFEST, Corrupt, load_arrays, load_json
 from genidm.robots import Robot, by_name, remade
 from genidm.store import Stage
 
@@ -34,16 +35,16 @@ LONGEST = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Take:
+class Clip:
     """One journey, up to its end: t states, the start among them.
 
     Attributes:
-      qpos: `[t, nq]`, of the drawing.
+      qpos: `[t, nq]`, of the visual model.
       position: `[t, 3]`, of the base, metres.
       waypoints: `[W, 3]`, metres.
       arrival: `[W]`, step at which a waypoint was reached; −1 where it was not.
       fell: whether it ended in a fall, or in physics that diverged.
-      control_step: seconds from one state to the next.
+      dt: seconds from one state to the next.
     """
 
     qpos: np.ndarray
@@ -51,12 +52,12 @@ class Take:
     waypoints: np.ndarray
     arrival: np.ndarray
     fell: bool
-    control_step: float
+    dt: float
 
     @property
     def times(self) -> np.ndarray:
         """Seconds since the start `[t]`."""
-        return self.control_step * np.arange(len(self.qpos))
+        return self.dt * np.arange(len(self.qpos))
 
     @property
     def seconds(self) -> float:
@@ -66,7 +67,7 @@ class Take:
     @property
     def arrivals(self) -> np.ndarray:
         """Seconds to each waypoint `[W]`; infinite where it was not reached."""
-        return np.where(self.arrival < 0, np.inf, self.control_step * self.arrival)
+        return np.where(self.arrival < 0, np.inf, self.dt * self.arrival)
 
     def left(self, seconds: np.ndarray) -> np.ndarray:
         """Which waypoints are left at some times `[n]`: `[n, W]` bool."""
@@ -83,8 +84,8 @@ class Take:
 
     def at(self, model: mujoco.MjModel, seconds: np.ndarray) -> np.ndarray:
         """Poses `[n, nq]` at some times `[n]`, between the steps on the straight way."""
-        before = np.clip(seconds // self.control_step, 0, len(self.qpos) - 2).astype(int)
-        share = seconds / self.control_step - before
+        before = np.clip(seconds // self.dt, 0, len(self.qpos) - 2).astype(int)
+        share = seconds / self.dt - before
         way, poses = np.zeros(model.nv), self.qpos[before].astype(float)
         for pose, after, part in zip(poses, self.qpos[before + 1], share, strict=True):
             mujoco.mj_differentiatePos(model, way, 1.0, pose, after.astype(float))
@@ -93,20 +94,20 @@ class Take:
 
 
 @dataclasses.dataclass(frozen=True)
-class Film:
-    """Takes of one robot.
+class Video:
+    """Clips of one robot.
 
     Attributes:
-      title: what the film is of.
-      drawing: what the robot looks like.
-      takes: its journeys.
-      reach: metres; a waypoint is reached when the robot is this near.
+      title: what the video is of.
+      visual_model: what the robot looks like.
+      clips: its journeys.
+      goal_radius: metres; a waypoint is reached when the robot is this near.
     """
 
     title: str
-    drawing: mujoco.MjSpec
-    takes: list[Take]
-    reach: float
+    visual_model: mujoco.MjSpec
+    clips: list[Clip]
+    goal_radius: float
 
 
 def between(x: np.ndarray, times: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -114,84 +115,90 @@ def between(x: np.ndarray, times: np.ndarray, seconds: np.ndarray) -> np.ndarray
     return np.stack([np.interp(seconds, times, column) for column in x.T], axis=-1)
 
 
-def film(
+def render(
     robot: Robot,
-    steering: Steering,
+    controller: ControllerFn,
     waypoints: Any,
     keys: jax.Array,
     yaw: jax.Array,
-    settings: Follow | None = None,
+    settings: WaypointSettings | None = None,
     title: str = "",
     *,
     quiet: bool = False,
-) -> Film:
+) -> Video:
     """Leads robots through waypoints, and keeps every pose.
 
     Args:
       robot: what walks.
-      steering: its controller.
+      controller: its controller.
       waypoints: `[W, 2]` or `[W, 3]`, metres, or for each robot its own, `[B, W, 2]`.
       keys: `[B]`, of the starts.
       yaw: `[B]`, radians, that the starts are turned by.
-      settings: length of a journey, reach.
-      title: what the film is of; the robot's name, unless given.
+      settings: length of a journey, goal radius.
+      title: what the video is of; the robot's name, unless given.
       quiet: no progress bar.
 
     Raises:
-      BadInput: the robot has no drawing, or the waypoints are none.
+      BadInput: the robot has no visual model, or the waypoints are none.
     """
-    settings, drawing = settings or Follow(), robot.drawing()
+    settings, visual_model = settings or WaypointSettings(), robot.visual_model()
     fill = np.arange(-(-len(keys) // LANES) * LANES) % len(keys)
     points = np.asarray(waypoints)
-    made = follow(
-        robot, steering, points[fill] if points.ndim == 3 else points, keys[fill], yaw[fill],
-        settings=settings, watch=operator.attrgetter("physics"), quiet=quiet,
+    made = follow_waypoints(
+        robot, controller, points[fill] if points.ndim == 3 else points, keys[fill], yaw[fill],
+        settings=settings, record=operator.attrgetter("physics"), quiet=quiet,
     )  # fmt: skip
-    takes = list(_takes(made, robot.posture(made.watched)))[: len(keys)]
-    return Film(title or robot.name, drawing, takes, settings.reach)
+    clips = list(_clips(made, robot.visual_qpos(made.recorded)))[: len(keys)]
+    return Video(title or robot.name, visual_model, clips, settings.goal_radius)
 
 
-def film_test(
+def render_test(
     robot: Robot,
-    steering: Steering,
+    controller: ControllerFn,
     episodes: Sequence[int] = EPISODES,
     seed: int = 0,
     seconds: float = LONGEST,
     title: str = "",
     *,
     quiet: bool = False,
-) -> Film:
+) -> Video:
     """Episodes of the test (A.1.3), from the same starts to the same targets.
 
     It walks anew. Float sums depend on how many robots walk at once, and walking is chaotic:
-    after some seconds a film may go another way than the test went (see `film_tested`).
+    after some seconds a video may go another way than the test went (see `render_recorded`).
 
     Args:
       robot: what walks.
-      steering: its controller.
+      controller: its controller.
       episodes: their numbers in the test seed, from 0 on.
       seed: of the test.
       seconds: a longer episode ends here.
-      title: what the film is of; the robot's name, unless given.
+      title: what the video is of; the robot's name, unless given.
       quiet: no progress bar.
 
     Raises:
-      BadInput: the robot has no drawing, or there is no such episode.
+      BadInput: the robot has no visual model, or there is no such episode.
     """
-    robot.drawing()  # before anything is computed
-    bank, test = scenarios(robot, 1, count_to(episodes, seed), first_seed=seed), Test()
-    settings = Follow(steps(robot, seconds, test.max_steps), test.reach)
-    keys, yaw, target = (x[0, np.asarray(episodes)] for x in (bank.keys, bank.yaw, bank.target))
-    return film(robot, steering, target[:, None], keys, yaw, settings, title, quiet=quiet)
+    robot.visual_model()  # before anything is computed
+    test_scenarios, test = (
+        scenarios(robot, 1, count_to(episodes, seed), first_seed=seed),
+        EvaluationSettings(),
+    )
+    settings = WaypointSettings(steps(robot, seconds, test.max_steps), test.goal_radius)
+    keys, yaw, target = (
+        x[0, np.asarray(episodes)]
+        for x in (test_scenarios.keys, test_scenarios.yaw, test_scenarios.target)
+    )
+    return render(robot, controller, target[:, None], keys, yaw, settings, title, quiet=quiet)
 
 
-def film_tested(
+def render_recorded(
     robot: Robot,
     test: Path | str,
     episodes: Sequence[int] = (),
     seconds: float = LONGEST,
     title: str = "",
-) -> Film:
+) -> Video:
     """Episodes of a test as they went: the recordings that the test has kept.
 
     Args:
@@ -199,59 +206,59 @@ def film_tested(
       test: the directory of a finished test (test-METHOD-SEED-…).
       episodes: their numbers in its first seed; all that it has recorded, unless given.
       seconds: a longer episode is cut here.
-      title: what the film is of; the robot's name, unless given.
+      title: what the video is of; the robot's name, unless given.
 
     Raises:
-      BadInput: the robot has no drawing, or the test has not recorded the episodes.
+      BadInput: the robot has no visual model, or the test has not recorded the episodes.
     """
-    drawing, settings = robot.drawing(), _said(test, "test")
+    visual_model, settings = robot.visual_model(), _said(test, "test")
     tree, _ = load_arrays(Path(test) / "episodes")
     recordings, outcome = tree.get("recordings", {}), tree["episodes"]
-    most, takes = steps(robot, seconds, settings["max_steps"]), list[Take]()
+    most, clips = steps(robot, seconds, settings["max_steps"]), list[Clip]()
     for i in episodes or sorted(map(int, recordings)) or EPISODES:
         if str(i) not in recordings:
             raise BadInput(f"{test} has no recording of episode {i}")
         made = recordings[str(i)]
         last = len(made["qpos"]) - 1
         reached, fell = (bool(outcome[name][0, i]) and last <= most for name in ("reached", "fell"))
-        takes.append(
-            Take(
+        clips.append(
+            Clip(
                 qpos=made["qpos"][: most + 1],
                 position=made["position"][: most + 1],
                 waypoints=made["target"][None],
                 arrival=np.asarray([last if reached else -1]),
                 fell=fell,
-                control_step=robot.control_step,
+                dt=robot.dt,
             )
         )
-    return Film(title or robot.name, drawing, takes, settings["reach"])
+    return Video(title or robot.name, visual_model, clips, settings["goal_radius"])
 
 
-def film_run(
+def render_run(
     run: Path | str,
     episodes: Sequence[int] = (),
     waypoints: Any = None,
     seed: int = 0,
     seconds: float = LONGEST,
-    reach: float = Follow.reach,
+    goal_radius: float = WaypointSettings.goal_radius,
     engine: str | None = None,
     robot: Robot | None = None,
-) -> Film:
-    """Films the controller that lies in a run's directory (METHOD-SEED-…).
+) -> Video:
+    """Renders the controller that lies in a run's directory (METHOD-SEED-…).
 
     Args:
-      run: the directory of a fit or a baseline, as cells leave it under --out.
+      run: the directory of a fit or a baseline, as cells leave it under --run-dir.
       episodes: numbers of the test's episodes, or of the starts; `EPISODES` and 0, unless given.
       waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test, and where
         one of the run's tests has recorded the episodes, as they went.
       seed: of the test, or of the starts.
       seconds: a longer journey ends here.
-      reach: metres; a given waypoint is reached when it is this near (the test has its own).
+      goal_radius: metres; a given waypoint is reached when it is this near (the test has its own).
       engine: that steps the robot; the run's own, unless given.
       robot: what walks; as the run's config has it, unless given.
 
     Raises:
-      BadInput: no controller lies there, its robot has no drawing, or a number cannot be.
+      BadInput: no controller lies there, its robot has no visual model, or a number cannot be.
     """
     starts = episodes or (EPISODES if waypoints is None else (0,))
     highest, robot = count_to(starts, seed), robot or robot_of(run, engine)
@@ -259,13 +266,13 @@ def film_run(
     if waypoints is None:
         test = recorded(run, robot, episodes) if seed == 0 else None
         if test:
-            return film_tested(robot, test, episodes, seconds, title)
-        return film_test(robot, controller.load(run, robot), starts, seed, seconds, title)
+            return render_recorded(robot, test, episodes, seconds, title)
+        return render_test(robot, load_controller(run, robot), starts, seed, seconds, title)
     check_value("seed", seed, checks.seed())
     keys = jax.random.split(jax.random.key(seed), highest)[np.asarray(starts)]
-    settings = Follow(steps(robot, seconds, Follow.max_steps), reach)
-    steering = controller.load(run, robot)
-    return film(robot, steering, waypoints, keys, jnp.zeros(len(keys)), settings, title)
+    settings = WaypointSettings(steps(robot, seconds, WaypointSettings.max_steps), goal_radius)
+    controller = load_controller(run, robot)
+    return render(robot, controller, waypoints, keys, jnp.zeros(len(keys)), settings, title)
 
 
 def recorded(run: Path | str, robot: Robot, episodes: Sequence[int] = ()) -> Path | None:
@@ -282,7 +289,7 @@ def recorded(run: Path | str, robot: Robot, episodes: Sequence[int] = ()) -> Pat
         try:
             of = _said(test, "fit"), _said(test, "engine")
         except BadInput:
-            continue  # somebody else's: no reason to have no film at all
+            continue  # somebody else's: no reason to have no video at all
         if of == (run.name, robot.engine_name):
             # By its files' names: who reads them sees whether they are whole.
             names = [name.split(".") for name in load_json(test / "episodes" / MANIFEST)]
@@ -298,9 +305,9 @@ def count_to(episodes: Sequence[int], seed: int = 0) -> int:
     Raises:
       BadInput: there is no such episode, none is named, or there is no such seed.
     """
-    check_value("the seed of a film", seed, count(0, 2**32 - 1))
+    check_value("the seed of a video", seed, count(0, 2**32 - 1))
     if not episodes:
-        raise BadInput("a film is of at least one episode")
+        raise BadInput("a video is of at least one episode")
     for i in episodes:
         check_value("the number of an episode", i, count(0, MOST_EPISODES - 1))
     return max(episodes) + 1
@@ -312,9 +319,9 @@ def steps(robot: Robot, seconds: float, most: int) -> int:
     Raises:
       BadInput: not a step fits into them.
     """
-    if not seconds >= robot.control_step:
-        raise BadInput(f"a film of the {robot.name} takes at least {robot.control_step} s")
-    return int(min(seconds / robot.control_step, most))
+    if not seconds >= robot.dt:
+        raise BadInput(f"a video of the {robot.name} takes at least {robot.dt} s")
+    return int(min(seconds / robot.dt, most))
 
 
 def robot_of(run: Path | str, engine: str | None = None) -> Robot:
@@ -331,7 +338,7 @@ def robot_of(run: Path | str, engine: str | None = None) -> Robot:
     for stage in (run, run.parent / experience) if experience else (run,):
         try:
             settings = load_json(stage / "config.json")["config"].get("robot")
-        except Torn:
+        except Corrupt:
             continue
         if settings:
             return remade(settings | ({"engine": engine} if engine else {}))
@@ -346,13 +353,13 @@ def _said(directory: Path | str, name: str) -> Any:
     return summary[name]
 
 
-def _takes(made: Journeys, qpos: np.ndarray) -> Iterator[Take]:
+def _clips(made: WaypointRuns, qpos: np.ndarray) -> Iterator[Clip]:
     for i, states in enumerate(made.steps + 1):
-        yield Take(
+        yield Clip(
             qpos=qpos[i, :states],
             position=made.position[i, :states],
             waypoints=made.waypoints[i],
             arrival=made.arrival[i],
             fell=bool(made.fell[i]),
-            control_step=made.control_step,
+            dt=made.dt,
         )

@@ -1,4 +1,4 @@
-"""Films as files: gif by Pillow, mp4 by the ffmpeg that comes with imageio-ffmpeg."""
+"""Videos as files: gif by Pillow, mp4 by the ffmpeg that comes with imageio-ffmpeg."""
 
 from __future__ import annotations
 

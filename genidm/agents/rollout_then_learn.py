@@ -1,0 +1,130 @@
+"""What all learners share: in an iteration every device steps its own lanes, then one learns."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import flax.struct
+import jax
+from jax.sharding import Mesh
+
+from genidm import devices
+from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.policy import Activation, Policy
+from genidm.experience import Experience
+from genidm.progress import compile_ahead
+from genidm.robots.base import Robot
+from genidm.rollout import narrow
+from genidm.tasks import EnvState, Task
+
+
+class AgentState(flax.struct.PyTreeNode):
+    """All that is carried from one iteration to the next.
+
+    Attributes:
+      lanes: the robots.
+      training: what learns. Its `actor_params` is what of it chooses actions: (statistics of the
+        inputs, parameters of the policy network).
+    """
+
+    env_state: EnvState
+    training_state: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutThenLearn:
+    """An iteration of two programs: all devices step, then one learns and the others wait.
+
+    Attributes:
+      title: what the learner is called in messages.
+      start: key → learner.
+      rollout: (statistics, policy, lanes `[B]`) → (lanes, Experience, what is learned from,
+        metrics), all but the lanes `[unroll_length, B, ...]`.
+      learn: (training state, what is learned from) → (training state, losses).
+      mesh: the devices that share the lanes; its first one learns.
+    """
+
+    title: str
+    start: Callable[[jax.Array], AgentState]
+    rollout: Callable[..., Any]
+    learn: Callable[..., Any]
+    mesh: Mesh
+
+    @functools.cached_property
+    def stepping(self) -> Any:
+        """The first program: `rollout`, each device with its own lanes, which it donates."""
+        sharded = devices.over_lanes(self.rollout, self.mesh, [None, None, 0], (0, 1, 1, 1))
+        return jax.jit(sharded, donate_argnums=2)
+
+    @functools.cached_property
+    def updating(self) -> Any:
+        """The second program: `learn`, on one device; it donates the training state."""
+        return jax.jit(self.learn, donate_argnums=0)
+
+    def acting(self, training: Any) -> tuple[Any, Any]:
+        """What chooses actions, a copy on every device."""
+        return devices.put(training.actor_params, self.mesh, None)
+
+    def place(self, learner: AgentState) -> AgentState:
+        return AgentState(
+            devices.put(learner.env_state, self.mesh),
+            devices.gather(learner.training_state, self.mesh),
+        )
+
+    def prepare(self, learner: AgentState) -> Iterate:
+        args = (*self.acting(learner.training_state), learner.env_state)
+        step = compile_ahead(f"{self.title}'s stepping", self.stepping, *args)
+        batch = jax.eval_shape(self.stepping, *args)[2]
+        update = compile_ahead(
+            f"{self.title}'s learning", self.updating, learner.training_state, batch
+        )
+
+        def iterate(learner: AgentState) -> tuple[AgentState, Experience, Metrics]:
+            lanes, experience, batch, seen = step(
+                *self.acting(learner.training_state), learner.env_state
+            )
+            training, losses = update(learner.training_state, devices.gather(batch, self.mesh))
+            return AgentState(lanes, training), experience, seen | losses
+
+        return iterate
+
+    def learning(self) -> Learning:
+        """As `collect` asks for it."""
+        return Learning(self.start, self.place, self.prepare)
+
+
+class Alternates(abc.ABC):
+    """Settings of an agent whose iteration is RolloutThenLearn.
+
+    Attributes:
+      activation: of the policy's hidden layers.
+      policy_hidden_layer_sizes: layers of the policy.
+    """
+
+    activation: ClassVar[Activation]
+    policy_hidden_layer_sizes: tuple[int, ...]
+
+    @abc.abstractmethod
+    def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
+        """The two programs of an iteration."""
+
+    def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
+        return self.programs(robot, task, mesh).learning()
+
+    def policy(self, robot: Robot, task: Task, learner: AgentState) -> Policy:
+        """The policy of a learner, without exploration."""
+        statistics, params = learner.training_state.actor_params
+        statistics = narrow(statistics)
+        return Policy(
+            params=params,
+            mean=statistics.mean,
+            std=statistics.std,
+            policy_hidden_layer_sizes=self.policy_hidden_layer_sizes,
+            activation=self.activation,
+            goal_conditioned=task.goal_conditioned,
+            robot=robot,
+        )
