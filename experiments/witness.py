@@ -38,6 +38,10 @@ except ImportError as error:  # an extra, and nothing else here works without it
 
 Seen = dict[str, np.ndarray]
 
+AGENT = HER_SP.agent
+assert isinstance(AGENT, SAC)
+DISCOUNTING = AGENT.discounting
+
 
 class GoalAnt(gymnasium.Wrapper):
     """gymnasium's Ant-v5 on HER_SP's task, as a goal environment for HER.
@@ -85,7 +89,7 @@ class GoalAnt(gymnasium.Wrapper):
         """
         fallen = np.array([info["fallen"] for info in np.atleast_1d(infos)])
         far = np.linalg.norm(achieved - desired, axis=-1)
-        charge = np.where(fallen, -1 / (1 - HER_SP.agent.discounting), -1.0)
+        charge = np.where(fallen, -1 / (1 - DISCOUNTING), -1.0)
         return np.where(far <= self.task.goal_radius, 0.0, charge.reshape(far.shape))
 
     def _seen(self, observation: np.ndarray) -> Seen:

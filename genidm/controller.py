@@ -121,7 +121,7 @@ class Controller(flax.struct.PyTreeNode):
         for name, allowed in (
             ("action_size", count(robot.action.size, robot.action.size)),
             ("idm", layers), ("lfm", layers), ("latent_size", optional(count(1, WIDEST))),
-            ("frame", one_of(get_args(Frame))),
+            ("input_frame", one_of(get_args(Frame))),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         architecture = Architecture(

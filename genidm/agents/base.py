@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Self
 
 import jax
 from jax.sharding import Mesh
@@ -33,8 +34,8 @@ class Learning(NamedTuple):
     prepare: Callable[[Any], Iterate]
 
 
-class Agent(Protocol):
-    """Settings of an agent: a frozen dataclass.
+class Agent(abc.ABC):
+    """Settings of an agent; subclasses are frozen dataclasses, so that their fields are flags.
 
     Attributes:
       num_envs: robots at once.
@@ -42,12 +43,20 @@ class Agent(Protocol):
     """
 
     @property
+    @abc.abstractmethod
     def num_envs(self) -> int: ...
     @property
+    @abc.abstractmethod
     def unroll_length(self) -> int: ...
 
+    @abc.abstractmethod
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         """The agent on this robot, its lanes sharded over the mesh."""
 
+    @abc.abstractmethod
     def policy(self, robot: Robot, task: Task, learner: Any) -> Policy | None:
         """The policy of a learner, without exploration; None if it learns nothing."""
+
+    def for_accelerator(self) -> Self:
+        """The settings where jax runs on an accelerator: these, unless a subclass has others."""
+        return self

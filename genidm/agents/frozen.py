@@ -9,11 +9,9 @@ import jax
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Iterate, Learning, Metrics
-from genidm.agents.off_policy import OffPolicy
+from genidm.agents.base import Agent, Iterate, Learning, Metrics
 from genidm.agents.policy import Policy, no_statistics
-from genidm.agents.ppo import PPO
-from genidm.agents.sac import SAC
+from genidm.agents.rollout_then_learn import LearningAgent
 from genidm.checks import check, number
 from genidm.experience import Experience
 from genidm.progress import compile_ahead
@@ -33,20 +31,19 @@ class Frozen:
       fraction: of the interactions that it learns from.
     """
 
-    agent: PPO | SAC
+    agent: LearningAgent
     fraction: float
 
     def __post_init__(self) -> None:
         check(self, fraction=number(0, 1, above=True, below=True))
 
     def for_accelerator(self) -> Frozen:
-        """The same with its agent's settings for an accelerator (`OffPolicy.for_accelerator`)."""
-        wide = self.agent.for_accelerator() if isinstance(self.agent, OffPolicy) else self.agent
-        return dataclasses.replace(self, agent=wide)
+        """The same with its agent's settings for an accelerator."""
+        return dataclasses.replace(self, agent=self.agent.for_accelerator())
 
 
 @dataclasses.dataclass(frozen=True)
-class Acting:
+class Acting(Agent):
     """The agent that a frozen one is once it has learned.
 
     Attributes:
@@ -54,7 +51,7 @@ class Acting:
       learned: what it ended with.
     """
 
-    agent: PPO | SAC
+    agent: LearningAgent
     learned: Policy
 
     @property

@@ -35,7 +35,7 @@ from genidm.agents.buffer import (
 )  # fmt: skip
 from genidm.agents.her import HER
 from genidm.agents.policy import Activation, no_statistics
-from genidm.agents.rollout_then_learn import AgentState, Alternates, RolloutThenLearn
+from genidm.agents.rollout_then_learn import AgentState, LearningAgent, RolloutThenLearn
 from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
@@ -85,7 +85,7 @@ class TrainingState(flax.struct.PyTreeNode):
 
 
 @dataclasses.dataclass(frozen=True)
-class OffPolicy(Alternates):
+class OffPolicy(LearningAgent):
     """Settings that off-policy learners share.
 
     Attributes:

@@ -29,7 +29,7 @@ from jax.sharding import Mesh
 
 from genidm.agents.base import Metrics
 from genidm.agents.policy import Activation, no_statistics, normalize
-from genidm.agents.rollout_then_learn import AgentState, Alternates, RolloutThenLearn
+from genidm.agents.rollout_then_learn import AgentState, LearningAgent, RolloutThenLearn
 from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
@@ -56,7 +56,7 @@ class TrainingState(flax.struct.PyTreeNode):
 
 
 @dataclasses.dataclass(frozen=True)
-class PPO(Alternates):
+class PPO(LearningAgent):
     """Settings of PPO.
 
     Attributes:

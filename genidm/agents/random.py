@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.base import Agent, Iterate, Learning, Metrics
 from genidm.agents.unroll import generate_unroll
 from genidm.checks import check, count
 from genidm.experience import Experience
@@ -20,7 +20,7 @@ from genidm.tasks import EnvState, Task, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomActions:
+class RandomActions(Agent):
     """Uniform actions in [−1, 1].
 
     Attributes:

@@ -13,7 +13,7 @@ import jax
 from jax.sharding import Mesh
 
 from genidm import devices
-from genidm.agents.base import Iterate, Learning, Metrics
+from genidm.agents.base import Agent, Iterate, Learning, Metrics
 from genidm.agents.policy import Activation, Policy
 from genidm.experience import Experience
 from genidm.progress import compile_ahead
@@ -26,9 +26,9 @@ class AgentState(flax.struct.PyTreeNode):
     """All that is carried from one iteration to the next.
 
     Attributes:
-      lanes: the robots.
-      training: what learns. Its `actor_params` is what of it chooses actions: (statistics of the
-        inputs, parameters of the policy network).
+      env_state: the robots.
+      training_state: what learns. Its `actor_params` choose actions: (statistics of the inputs,
+        parameters of the policy network).
     """
 
     env_state: EnvState
@@ -97,7 +97,7 @@ class RolloutThenLearn:
         return Learning(self.start, self.place, self.prepare)
 
 
-class Alternates(abc.ABC):
+class LearningAgent(Agent):
     """Settings of an agent whose iteration is RolloutThenLearn.
 
     Attributes:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from genidm.agents.base import Agent
 from genidm.agents.ddpg import DDPG
 from genidm.agents.frozen import Frozen
 from genidm.agents.her import HER
 from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
+from genidm.agents.rollout_then_learn import LearningAgent
 from genidm.agents.sac import SAC
 from genidm.checks import check, check_value, count, label, positive
 from genidm.controller import Frame
@@ -35,7 +37,7 @@ class Method:
     """
 
     name: str
-    agent: PPO | SAC | DDPG | RandomActions | Frozen
+    agent: Agent | Frozen
     task: WalkForward | GoToGoal
 
     def __post_init__(self) -> None:
@@ -46,7 +48,7 @@ class Method:
 class GoalConditioned(Method):
     """A baseline (§5.1): the agent learns to go to goals, and its policy is the controller."""
 
-    agent: PPO | SAC | DDPG
+    agent: LearningAgent
     task: GoToGoal
 
 
@@ -112,11 +114,11 @@ class Choices:
     goal_horizon: int = 100
     mirror: bool = True
 
-    def agent(self, training: protocol.Training, her: HER | None = None) -> PPO | SAC | DDPG:
+    def agent(self, training: protocol.Training, her: HER | None = None) -> LearningAgent:
         """The agent of a row of Table 2."""
         agents: dict[str, Any] = {"PPO": self.ppo, "SAC": self.sac, "DDPG": self.ddpg}
         relabelling = {"her": her} if her else {}
-        agent: PPO | SAC | DDPG = dataclasses.replace(
+        agent: LearningAgent = dataclasses.replace(
             agents[training.algorithm or ""],
             policy_hidden_layer_sizes=training.policy,
             **relabelling,
@@ -161,13 +163,10 @@ def column(robot: str, choices: Choices) -> Column:
     )
 
 
-def _collector(
-    robot: str, choices: Choices, training: protocol.Training
-) -> PPO | SAC | RandomActions | Frozen:
+def _collector(robot: str, choices: Choices, training: protocol.Training) -> Agent | Frozen:
     if training.algorithm is None:
         return RandomActions()
     agent = choices.agent(training)
-    assert not isinstance(agent, DDPG)  # which trains baselines alone
     before = protocol.LEARNED_BEFORE.get(robot)
     if before is None:
         return agent

@@ -8,7 +8,6 @@ from typing import Any
 
 from genidm import devices
 from genidm.agents.frozen import Frozen
-from genidm.agents.off_policy import OffPolicy
 from genidm.agents.ppo import PPO
 from genidm.checks import check, count, optional
 from genidm.config import flat, to_json
@@ -67,16 +66,9 @@ def resolve(
       BadInput: the scale is none, or the paper has no other settings for the method.
     """
     scale = scale_of(options.scale, robot.paper_interactions)
-    if isinstance(method.agent, PPO) and method.agent == PPO(
-        policy_hidden_layer_sizes=method.agent.policy_hidden_layer_sizes
-    ):
-        agent = dataclasses.replace(
-            scale.ppo, policy_hidden_layer_sizes=method.agent.policy_hidden_layer_sizes
-        )
-        method = dataclasses.replace(method, agent=agent)
-    if devices.memory() is not None and isinstance(method.agent, OffPolicy | Frozen):
-        wide: Any = method.agent.for_accelerator()  # of the method's own type
-        method = dataclasses.replace(method, agent=wide)
+    agent = _at_scale(method.agent, scale)
+    agent = agent if devices.memory() is None else agent.for_accelerator()
+    method = dataclasses.replace(method, agent=agent)
     if isinstance(method, GoalConditioned):
         if options.paper_settings:
             raise BadInput(f"{method.name} has no settings that the paper's letter would change")
@@ -85,6 +77,15 @@ def resolve(
     if method.generalize:
         method = dataclasses.replace(method, generalize=method.generalize.on(robot))
     return method
+
+
+def _at_scale(agent: Any, scale: Scale) -> Any:
+    """PPO at its defaults as the scale has it, with its own layers; other agents as they are."""
+    if not isinstance(agent, PPO):
+        return agent
+    layers = agent.policy_hidden_layer_sizes
+    usual = agent == PPO(policy_hidden_layer_sizes=layers)
+    return dataclasses.replace(scale.ppo, policy_hidden_layer_sizes=layers) if usual else agent
 
 
 def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:

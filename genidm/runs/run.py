@@ -269,7 +269,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         if m.generalize is None:
             return None
         source = self.experience_stage.directory.name
-        config = {"experience": source, "share": m.fraction, "generalize": m.generalize}
+        config = {"experience": source, "fraction": m.fraction, "generalize": m.generalize}
         name = f"replay-{m.generalize.mode}-{self.seed}"
         return self._stage(name, config, "genidm.paper.generalize")
 
