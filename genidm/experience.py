@@ -185,7 +185,7 @@ def _named(experience: Experience) -> Experience:
     """The record with lists, which are trees to jax, as arrays."""
     lists = {
         f.name: np.asarray(x) if isinstance(x, list | tuple) else x
-        for f in dataclasses.fields(experience)
+        for f in dataclasses.fields(Experience)
         if (x := getattr(experience, f.name)) is not None or f.name == "physics"
     }
     return experience.replace(**lists)
