@@ -36,7 +36,7 @@ class EnvState(flax.struct.PyTreeNode):
 
     @property
     def relative_goal(self) -> Any:
-        """Vectors `[B, 3]` from the robots to their goals, metres; None if the task has no goals."""
+        """Vectors `[B, 3]` from robots to goals, metres; None if the task has no goals."""
         return None if self.goal is None else self.goal - self.robots.position
 
 
