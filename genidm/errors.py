@@ -8,7 +8,7 @@ class BadInput(Exception):
 
 
 def sentence(error: BaseException) -> str | None:
-    """The message of a BadInput inside a jax error, or of a lack of memory; None for other errors.
+    """Message for a jax error that wraps BadInput or reports lack of memory; None for others.
 
     If a host callback (`jax.pure_callback`) raises BadInput, jax raises its own error, whose
     text contains the BadInput in one line.

@@ -252,7 +252,7 @@ def _check_continuous(clean: Experience, robot: Robot) -> None:
 
 
 def _gaps(clean: Experience) -> tuple[np.ndarray, np.ndarray]:
-    """Metres `[T, B]` from o' of the previous valid step to o, and the steps between them `[T, B]`.
+    """Metres `[T, B]` from the previous valid step's o_next to o, and how many steps ago it was.
 
     Without a previous valid step in the episode, the distance is 0.
     """

@@ -46,8 +46,8 @@ class Outcome(NamedTuple):
     Attributes:
       reward: reward of the step.
       terminal: bool, the episode ends here, but not by the time limit.
-      absorbing_reward: reward of every step after a terminal step, for ever. So a fall does not
-        spare the robot the later negative rewards.
+      absorbing_reward: reward of every step after a terminal step, for ever. So the value of a
+        fall includes the negative rewards that would follow.
     """
 
     reward: jax.Array
@@ -338,5 +338,5 @@ def input_size(robot: Robot, task: Task) -> int:
 
 
 def bootstrapped_reward(step: Outcome | Transition, discounting: float) -> jax.Array:
-    """Reward `[...]` of a step plus, if it is terminal, r γ / (1 − γ) of absorbing rewards r."""
+    """Reward `[...]` of a step plus, if it is terminal, γ / (1 − γ) times the absorbing reward."""
     return step.reward + step.terminal * step.absorbing_reward * discounting / (1 - discounting)

@@ -40,7 +40,7 @@ def collect(
 ) -> tuple[Any, Any]:
     """Train an agent for a number of interactions, and record all of them.
 
-    The record contains exactly the steps that the agent learned from, in time order.
+    The training steps themselves are recorded, so a record needs no extra interactions.
 
     Args:
       robot: the robot.

@@ -21,7 +21,7 @@ from genidm.tasks import EnvState, Task, input_size
 
 @dataclasses.dataclass(frozen=True)
 class Frozen:
-    """Settings: train an agent first, then record experience with its fixed policy.
+    """Settings to train an agent first, and then record experience with its fixed policy.
 
     The training steps are not recorded. The final policy collects the record, with the same
     exploration as in training.
@@ -38,7 +38,7 @@ class Frozen:
         check(self, fraction=number(0, 1, above=True, below=True))
 
     def for_accelerator(self) -> Frozen:
-        """Settings for an accelerator, which are the agent's."""
+        """These settings, with the agent's settings for an accelerator."""
         return dataclasses.replace(self, agent=self.agent.for_accelerator())
 
 

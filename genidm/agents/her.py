@@ -56,7 +56,7 @@ class HER:
         return jnp.where(relabelled[:, None], reached, buffer.rows.goal[at.row, at.lane])
 
     def _window(self, buffer: Buffer, left: jax.Array, at: Index) -> tuple[jax.Array, jax.Array]:
-        """Offsets `[N]` from a step to the first and last step whose o' may be its goal."""
+        """Offsets `[N]` from a step to the first and last step whose o_next may be its goal."""
         left = left[at.row, at.lane]
         if self.goal_selection_strategy == "future":
             return jnp.zeros_like(left), left

@@ -216,7 +216,7 @@ class OffPolicy(LearningAgent):
     def sample(
         self, robot: Robot, task: Task, buffer: Buffer, left: jax.Array, key: jax.Array
     ) -> BraxTransition:
-        """Sample a minibatch `[batch_size, ...]`; with HER, relabel goals and rewards.
+        """Sample a minibatch `[batch_size, ...]`; with HER, relabel goals and recompute rewards.
 
         A step at the time limit is not terminal: it is marked as truncated, and the losses
         ignore it.

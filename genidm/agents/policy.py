@@ -99,7 +99,7 @@ class Policy(flax.struct.PyTreeNode):
         }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
-        """Writes the policy as a directory, without pickle.
+        """Write the policy as a directory, without pickle.
 
         Raises:
           BadInput: the path exists, and `overwrite` is False.

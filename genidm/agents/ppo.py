@@ -1,9 +1,9 @@
-"""PPO (Schulman et al. 2017), composed from Brax's networks, losses and statistics.
+"""PPO (Schulman et al. 2017), built from Brax's networks, losses and statistics.
 
 An iteration has two programs. In the first, every device steps its own lanes. In the second,
 one device updates the input statistics and makes `num_updates_per_batch` passes over the batch.
-One device learns, for three reasons. To average gradients of networks this small takes longer
-than to compute them (four CPU devices: 0.6 s per iteration instead of 0.3). The result does not
+Only one device learns, for three reasons. With networks this small it is faster than four CPU
+devices that average their gradients (0.3 s per iteration instead of 0.6). The result does not
 depend on the number of devices. XLA's collectives on a CPU can deadlock when cores are scarce.
 """
 

@@ -87,7 +87,7 @@ def _reset_ended(robot: Robot, task: Task, carry: _Carry, seen: Transition) -> _
         fresh = select(carry.used, task.start(robot, keys), carry.fresh)
         return fresh, jnp.zeros_like(carry.used)
 
-    # A short episode can end a second time in one rollout; only then resets run in the loop.
+    # Only if a lane ends a second episode in one rollout, draw new fresh states in the loop.
     none_left = (seen.last & carry.used).any()
     fresh, used = jax.lax.cond(none_left, refill, lambda: (carry.fresh, carry.used))
     going = carry.lanes.replace(robots=seen.after, episode_step=carry.lanes.episode_step + 1)
