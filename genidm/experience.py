@@ -290,7 +290,7 @@ def _check_orientation(clean: Experience, robot: Robot) -> None:
             np.cos(np.asarray(field.yaw(jnp.asarray(x))) - course).mean() for x in (part, other)
         )
         if as_given < 0.5 and converted > 0.9:
-            raise BadInput(f"experience: {field.name!r} (s) fits the robot's motion only {words}")
+            raise BadInput(f"experience: {field.name!r} fits the robot's motion only {words} (s)")
 
 
 def record(step: Transition) -> Experience:

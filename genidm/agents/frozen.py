@@ -77,7 +77,7 @@ class Acting(Agent):
             return task.start(robot, jax.random.split(key, self.num_envs))
 
         def prepare(lanes: EnvState) -> Iterate:
-            program = compile_ahead("a frozen agent's stepping", stepping, *actor_params, lanes)
+            program = compile_ahead("rollout of the fixed policy", stepping, *actor_params, lanes)
 
             def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
                 lanes, experience, _, seen = program(*actor_params, lanes)

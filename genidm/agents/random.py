@@ -57,7 +57,7 @@ class RandomActions(Agent):
         def prepare(lanes: EnvState) -> Iterate:
             sharded = devices.over_lanes(stepping, mesh, [0], (0, 1, 1, 1))
             jitted = jax.jit(sharded, donate_argnums=0)
-            program = compile_ahead("random stepping", jitted, lanes)
+            program = compile_ahead("rollout of random actions", jitted, lanes)
 
             def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
                 lanes, experience, _, seen = program(lanes)

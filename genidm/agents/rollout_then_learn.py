@@ -77,10 +77,10 @@ class RolloutThenLearn:
 
     def prepare(self, learner: AgentState) -> Iterate:
         args = (*self.acting(learner.training_state), learner.env_state)
-        step = compile_ahead(f"{self.title}'s stepping", self.stepping, *args)
+        step = compile_ahead(f"rollout of {self.title}", self.stepping, *args)
         batch = jax.eval_shape(self.stepping, *args)[2]
         update = compile_ahead(
-            f"{self.title}'s learning", self.updating, learner.training_state, batch
+            f"learning of {self.title}", self.updating, learner.training_state, batch
         )
 
         def iterate(learner: AgentState) -> tuple[AgentState, Experience, Metrics]:
