@@ -98,8 +98,10 @@ class Experience(flax.struct.PyTreeNode):
         Raises:
           BadInput: the shapes do not fit each other or the robot, or a valid step is impossible:
             NaN or infinity, an action outside [−1, 1], an invalid orientation, a position that
-            jumps, or `first` without `last` in the step before.
+            jumps, `first` without `last` in the step before, or a log without any first or last step.
         """
+        if isinstance(self, Prepared) and self.robot == robot.name:
+            return self
         made = _as_floats(jax.tree.map(_as_numpy, _lists_as_arrays(self)))
         _check_shapes(made, robot)
         clean = _zero_invalid(made)
@@ -111,7 +113,8 @@ class Experience(flax.struct.PyTreeNode):
             clean = clean.centred()
         narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
         s = np.asarray(robot.observation.canonical(jnp.asarray(narrow.s)))
-        return narrow.replace(s=s.astype(np.float32, copy=False))
+        fields = {f.name: getattr(narrow, f.name) for f in dataclasses.fields(Experience)}
+        return Prepared(**fields | {"s": s.astype(np.float32, copy=False)}, robot=robot.name)
 
     @property
     def far_away(self) -> bool:
@@ -129,6 +132,26 @@ class Experience(flax.struct.PyTreeNode):
         first = np.take_along_axis(valid, start, axis=0)
         origin = np.take_along_axis(o, first[..., None], axis=0) * [1, 1, 0]
         return self.replace(o=o - origin, o_next=np.asarray(self.o_next) - origin)
+
+
+class Prepared(Experience):
+    """The result of `Experience.prepared`, which is not checked a second time.
+
+    Attributes:
+      robot: name of the robot that the record was checked for.
+    """
+
+    robot: str = flax.struct.field(pytree_node=False, default="")
+
+
+def _changed(prepared: Prepared, **changes: Any) -> Experience:
+    """Replace fields; the result is an Experience, so that it is checked again."""
+    fields = {f.name: getattr(prepared, f.name) for f in dataclasses.fields(Experience)}
+    return Experience(**fields | changes)
+
+
+# Set after the class body, because flax then adds its own `replace`.
+setattr(Prepared, "replace", _changed)  # noqa: B010  mypy rejects a plain assignment
 
 
 def _as_numpy(x: Any) -> np.ndarray:
@@ -162,7 +185,7 @@ def _lists_as_arrays(experience: Experience) -> Experience:
     """Convert lists to arrays, because jax treats lists as trees."""
     arrays = {
         f.name: np.asarray(x) if isinstance(x, list | tuple) else x
-        for f in dataclasses.fields(experience)
+        for f in dataclasses.fields(Experience)
         if (x := getattr(experience, f.name)) is not None or f.name == "physics"
     }
     return experience.replace(**arrays)
@@ -235,6 +258,8 @@ def _check_continuous(clean: Experience, robot: Robot) -> None:
             raise BadInput(f"experience: step [{t + 1}, {lane}] is {what}")
     if clean.physics is not None:  # only logs have measured positions, which can jump
         return
+    if not (clean.first | clean.last).any():
+        raise BadInput("experience: no step is marked as the first or the last of an episode")
     step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
     # Not the maximum: if a position is corrected every second, 2 % of the steps are jumps.
     usual = np.quantile(step[clean.valid], 0.9)

@@ -602,7 +602,7 @@ def test_what_has_learned_nan_is_not_done(tmp_path: Path, name: str) -> None:
         return {}
 
     with pytest.raises(
-        BadInput, match=r"training/networks/\S+ holds NaN or infinity after 640 int"
+        BadInput, match=r"training_state/networks/\S+ holds NaN or infinity after 640 int"
     ):
         stage.run_once(work)
     assert not stage.done and not stage.checkpoints().steps()
