@@ -98,7 +98,7 @@ class Experience(flax.struct.PyTreeNode):
         Raises:
           BadInput: the shapes do not fit each other or the robot, or a valid step is impossible:
             NaN or infinity, an action outside [−1, 1], an invalid orientation, a position that
-            jumps, `first` without `last` in the step before, or a log without any first or last step.
+            jumps, or `first` without `last` in the step before; or a log has neither.
         """
         if isinstance(self, Prepared) and self.robot == robot.name:
             return self
