@@ -148,7 +148,7 @@ def column(robot: str, choices: Choices) -> Column:
         return GoalConditioned(name, choices.agent(table[name], her), task)
 
     lr = inverse("LR", protocol.LATENT_SIZE[robot])
-    # LR comes nearer with these than with the paper's, which `paper_settings` has (docs/choices.md).
+    # These come nearer than the paper's (docs/choices.md), which `paper_settings` has.
     lr_fit = dataclasses.replace(lr.fit, latent_loss_weight=0.75, mean_latent=False)
     rl = inverse("RL")
     return (
