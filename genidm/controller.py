@@ -212,5 +212,5 @@ def _as_wanted(path: Path | str, found: Any, wanted: Any) -> None:
     if differs := trees.difference(trees.kinds(found), trees.kinds(wanted)):
         name, saved, expected = differs
         raise BadInput(f"{path}: {name} is {saved}, but its architecture needs {expected}")
-    if name := trees.not_finite(found):
-        raise BadInput(f"{path}: {name} holds NaN or infinity")
+    if not_finite := trees.not_finite(found):
+        raise BadInput(f"{path}: {not_finite} holds NaN or infinity")
