@@ -209,8 +209,8 @@ def follow_waypoints(
     seen = [jax.tree.map(lambda x: np.asarray(x)[None], look(walker.robots))]
     with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
         for made in range(0, settings.max_steps, settings.chunk):
-            walker, way = step(controller, walker)
-            seen.append(jax.tree.map(np.asarray, way))
+            walker, kept = step(controller, walker)
+            seen.append(jax.tree.map(np.asarray, kept))
             bar.advance(min(settings.chunk, settings.max_steps - made))
             if not np.asarray(walker.going).any():
                 break

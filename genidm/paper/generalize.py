@@ -126,7 +126,7 @@ def residual(
 
     Args:
       experience: the record.
-      turned: its replay.
+      turned: the rotated replay of the record.
       steps: largest number of steps after a placement to report.
 
     Returns:

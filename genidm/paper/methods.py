@@ -127,7 +127,10 @@ class Choices:
 
 
 def column(robot: str, choices: Choices) -> Column:
-    """Make the methods of Table 1 for one robot, with the settings of Table 2 and A.1.2, and HF."""
+    """Make the methods of Table 1 for one robot, with the settings of Table 2 and A.1.2.
+
+    The last is HF, which is not in the paper: RL in the heading frame.
+    """
     table = protocol.TABLE2[robot]
 
     def inverse(name: str, latent_size: int | None = None) -> InverseDynamics:

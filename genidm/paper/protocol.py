@@ -63,7 +63,10 @@ TABLE2: Mapping[str, Mapping[str, Training]] = {
         "LR": Training(policy=_64, lfm=_256, idm=_50, algorithm="PPO"),
     },
 }
-"""Table 2: robot → method → networks and training algorithm."""
+"""Table 2: robot → method → networks and training algorithm.
+
+HER_SP is the paper's HER-Sparse (HER-Sp), HER_DE its HER-Dense (HER-De).
+"""
 
 INTERACTIONS = {"humanoid": 15_000_000, "minitaur": 4_000_000, "ant": 2_000_000}
 """Table 2: robot → environment interactions of each method."""
