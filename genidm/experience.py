@@ -100,6 +100,8 @@ class Experience(flax.struct.PyTreeNode):
             be: numbers that are not finite, actions outside [−1, 1], an orientation that is none,
             positions that jump, episodes that begin where none has ended.
         """
+        if isinstance(self, Prepared) and self.robot == robot.name:
+            return self
         made = _numbers(jax.tree.map(_plain, _named(self)))
         _fitting(made, robot)
         clean = _cleared(made)
@@ -111,7 +113,8 @@ class Experience(flax.struct.PyTreeNode):
             clean = clean.centred()
         narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
         s = np.asarray(robot.observation.canonical(jnp.asarray(narrow.s)))
-        return narrow.replace(s=s.astype(np.float32, copy=False))
+        fields = {f.name: getattr(narrow, f.name) for f in dataclasses.fields(Experience)}
+        return Prepared(**fields | {"s": s.astype(np.float32, copy=False)}, robot=robot.name)
 
     @property
     def far_away(self) -> bool:
@@ -129,6 +132,26 @@ class Experience(flax.struct.PyTreeNode):
         first = np.take_along_axis(valid, start, axis=0)
         origin = np.take_along_axis(o, first[..., None], axis=0) * [1, 1, 0]
         return self.replace(o=o - origin, o_next=np.asarray(self.o_next) - origin)
+
+
+class Prepared(Experience):
+    """What `Experience.prepared` returns: it is checked once, however often it is prepared.
+
+    Attributes:
+      robot: name of the robot that it was checked for.
+    """
+
+    robot: str = flax.struct.field(pytree_node=False, default="")
+
+
+def _changed(prepared: Prepared, **changes: Any) -> Experience:
+    """An Experience with changes, which has to be checked again."""
+    fields = {f.name: getattr(prepared, f.name) for f in dataclasses.fields(Experience)}
+    return Experience(**fields | changes)
+
+
+# flax gives each class a `replace` of its own, after its body.
+setattr(Prepared, "replace", _changed)  # noqa: B010  mypy takes no assignment to a method
 
 
 def _plain(x: Any) -> np.ndarray:
@@ -162,7 +185,7 @@ def _named(experience: Experience) -> Experience:
     """The record with lists, which are trees to jax, as arrays."""
     lists = {
         f.name: np.asarray(x) if isinstance(x, list | tuple) else x
-        for f in dataclasses.fields(experience)
+        for f in dataclasses.fields(Experience)
         if (x := getattr(experience, f.name)) is not None or f.name == "physics"
     }
     return experience.replace(**lists)
@@ -232,6 +255,8 @@ def _continuous(clean: Experience, robot: Robot) -> None:
             raise BadInput(f"experience: step [{t + 1}, {lane}] {what} (first, last)")
     if clean.physics is not None:  # a simulation knows where its robots are
         return
+    if not (clean.first | clean.last).any():
+        raise BadInput("experience: no step is marked as the first or the last of an episode")
     step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
     # Not all of the steps: where a position is put right each second, two in a hundred are jumps.
     usual = np.quantile(step[clean.valid], 0.9)

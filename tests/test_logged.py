@@ -83,6 +83,30 @@ def test_a_goal_horizon_longer_than_all_episodes_is_said() -> None:
         generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), goal_horizon=61)
 
 
+def test_a_record_is_checked_once_and_again_when_it_changes() -> None:
+    robot, prepared = Mine(), log().prepared(Mine())
+    assert prepared.prepared(robot) is prepared
+    half = prepared.first_fraction(0.5)
+    assert half.prepared(robot) is half
+    with pytest.raises(BadInput, match="a lies outside"):
+        prepared.replace(a=2 + prepared.a).prepared(robot)
+
+    class Other(Mine):
+        name = "other"
+        action = Layout((symmetry.joints("torque", [0], [1], "of full torque"),))
+
+    with pytest.raises(BadInput, match="a has shape"):
+        prepared.prepared(Other())
+
+
+def test_a_log_without_episodes_is_refused() -> None:
+    nothing = np.zeros_like(log().first)
+    with pytest.raises(BadInput, match="no step is marked as the first or the last"):
+        log().replace(first=nothing, last=nothing).prepared(Mine())
+    for flags in ({"first": nothing}, {"last": nothing}):
+        log().replace(**flags).prepared(Mine())
+
+
 def test_nothing_can_be_stepped() -> None:
     robot = Mine()
     for call in (robot.reset, robot.step, robot.set_state, robot.cost):
