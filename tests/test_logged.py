@@ -281,7 +281,7 @@ def test_a_controller_knows_the_layout_it_was_made_for(tmp_path: Path) -> None:
     other, fields = Mine(), Mine.observation.fields
     for observation in (Layout(fields[::-1]), Layout((*fields, symmetry.invariant("height")))):
         other.observation = observation
-        with pytest.raises(BadInput, match=r"another observation of the mine: orientation .* here"):
+        with pytest.raises(BadInput, match=r"another observation of the mine: it has orientation "):
             controller.load(tmp_path / "controller", other)
     more = Mine()
     more.action = Layout((symmetry.joints("torque", [1, 0, 2], [1, 1, 1], "of full torque"),))
@@ -314,13 +314,13 @@ def foreign(directory: Path, **changes: Any) -> None:
         (dict(idm=[8] * 999), "idm must be a list"), (dict(lfm=[8.5]), "lfm holds a width"),
         (dict(latent_size=10**18), "latent_size must be at most"),
         (dict(latent_size=-1), "latent_size must be at least"),
-        (dict(latent_size=3), "where its architecture has"),
+        (dict(latent_size=3), "but its architecture needs"),
         (dict(action_size=3), "action_size must be"), (dict(input_frame="body"), "frame must be"),
         (dict(input_frame=None), "frame must be"), (dict(robot=None), "a controller for None"),
         (dict(robot=["mine"]), "a controller for"),
         (dict(robot="a\x1b[2J\nb"), r"for 'a\\x1b\[2J\\n"),
-        (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\) there"),
-        (dict(observation=7), "no list of fields there"),
+        (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\); the robot"),
+        (dict(observation=7), "it has no list of fields"),
     ],
 )  # fmt: skip
 def test_what_a_controllers_directory_says_may_be_anything(
@@ -337,7 +337,7 @@ def test_what_a_controllers_directory_says_may_be_anything(
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda x: x.T, r"is float32\[\d+, \d+\], where its architecture has"),
+        (lambda x: x.T, r"is float32\[\d+, \d+\], but its architecture needs"),
         (lambda x: x * np.nan, "holds NaN or infinity"),
         (lambda x: x.astype(np.float64), "is float64"),
         (lambda x: x.astype("U3"), "is <U3"),
