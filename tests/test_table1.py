@@ -50,7 +50,7 @@ def options(out: Path, **changes) -> Table:
         episodes_per_extra_seed=1,
         test=TEST,
     )
-    return dataclasses.replace(this, **{"results": out / "results", **changes})
+    return dataclasses.replace(this, **{"report_dir": out / "results", **changes})
 
 
 @pytest.fixture(scope="module", autouse=True)
