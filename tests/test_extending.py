@@ -271,7 +271,8 @@ def test_what_lacks_a_method_is_no_robot_yet() -> None:
     with pytest.raises(BadInput, match=r"^Half is not a complete robot: it lacks cost, dt, "):
         robots.register(Half)
     engine = type("Half", (Engine,), {"name": "half"})
-    with pytest.raises(BadInput, match=r"^Half is not a complete engine: it lacks __str__, label, step$"):
+    sentence = r"^Half is not a complete engine: it lacks __str__, label, step$"
+    with pytest.raises(BadInput, match=sentence):
         engines.register(engine)
     unsized = type(
         "Unsized", (MujocoRobot,), {"name": "unsized", "model": "x.xml", "frame_skip": 5}
@@ -287,5 +288,5 @@ def test_a_robot_that_steps_itself_takes_no_engine(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setitem(ROBOTS, "point", Point)
     assert by_name("point").engine is None
-    with pytest.raises(BadInput, match=r"^the point steps itself: it takes no engine 'mjx'$"):
+    with pytest.raises(BadInput, match=r"^the point steps itself and takes no engine, got 'mjx'$"):
         by_name("point", "mjx")

@@ -166,7 +166,7 @@ def test_a_robot_is_made_again_from_its_settings(robot, tmp_path: Path) -> None:
 def test_settings_of_no_robot_are_refused() -> None:
     settings = json.loads(json.dumps(to_json(Ant().settings)))
     for wrong in ({"legs": 6}, {"solver": {**settings["solver"], "bends": 1}}):
-        with pytest.raises(BadInput, match="makes no ant"):
+        with pytest.raises(BadInput, match="cannot make the ant"):
             remade(settings | wrong)
 
 

@@ -200,9 +200,7 @@ class Pool:
         for _ in range(TRIES):
             with contextlib.suppress(Lost, OSError):
                 return Worker(self.command, self.size)
-        raise BadInput(
-            f"a worker process failed to start, {TRIES} times: {' '.join(self.command)}"
-        )
+        raise BadInput(f"a worker process failed to start, {TRIES} times: {' '.join(self.command)}")
 
     def _count(self, rows: int) -> None:
         with self._counting:
