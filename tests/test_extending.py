@@ -122,7 +122,7 @@ def test_its_physics_is_measured(
     drifts = {row["engine"]: row["median"] for row in written["drift"]}
     assert drifts["C float64 rows"][0] < 1e-12 < drifts["C float32 rows"][0] < 1e-5
     assert "elliptic 4/8" in capsys.readouterr().out
-    with pytest.raises(BadInput, match=r"^no robot 'minitaur' has a MuJoCo model; ant, humanoid"):
+    with pytest.raises(BadInput, match=r"^--robot must be ant, humanoid"):
         physics.physics(physics.Options(robot="minitaur"))
 
 
