@@ -19,7 +19,7 @@ from genidm.report.rows import jsonable
 from genidm.runs.cell import saved
 from genidm.runs.command import run_cli
 
-# Metres. The path goes ahead, turns left and right, and returns near its start.
+# Metres. The path goes ahead, turns left by more than 180°, and ends 2.8 m from its start.
 LOOP = (3.0, 0.0, 5.0, 2.0, 4.0, 5.0, 0.0, 5.0, -2.0, 2.0)
 
 

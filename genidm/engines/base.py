@@ -66,7 +66,7 @@ class Engine(abc.ABC):
       name: the value of `--engine`.
       label: name in tables, with the precision of its physics between control steps.
       on_accelerator: whether it is the default where jax has an accelerator (else: on a CPU).
-      segment: control steps for which a turned replay stays within millimetres of the record
+      segment: control steps for which a rotated replay stays within millimetres of the record
         (docs/physics.md); the default length of 𝒢's segments.
       one_device: whether all lanes are on one jax device, because the engine distributes them
         over its own threads or processes.

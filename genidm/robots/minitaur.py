@@ -47,8 +47,8 @@ class Physics(flax.struct.PyTreeNode):
     Attributes:
       pose: `[B, 23]`; base position (m) and quaternion, then joint angles (rad).
       motion: `[B, 22]`; base velocity (m/s) and spin (rad/s), then joint velocities (rad/s).
-      motors: `[B, 16]`; for each motor the physics steps since it is hot, then the observed
-        torques (N·m).
+      motors: `[B, 16]`; for each motor the number of successive physics steps above the torque
+        `minitaur_world.HOT`, then the observed torques (N·m).
     """
 
     pose: Any
@@ -100,8 +100,8 @@ class Minitaur(Robot):
 
     A step is a function of `State.physics` alone. For every step a free process sets the robot's
     state and makes five physics steps. So states can be set, replayed and resumed at no cost, and
-    a process that dies loses nothing. The disadvantage: the contacts that Bullet keeps from step
-    to step are lost (docs/physics.md).
+    a process that dies loses nothing. But the contacts that Bullet keeps from step to step are
+    lost (docs/physics.md).
 
     The model is not exactly its own mirror image: the shins of a leg are joined with an offset of
     5 mm, towards the same side in all legs, and one of the eight motors, front left R, has almost

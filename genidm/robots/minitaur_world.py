@@ -72,7 +72,7 @@ ROW = {
 
 Base position (m), orientation (w, x, y, z), joint angles (rad, motors before knees); base
 velocity (m/s) and spin (rad/s) in the world frame, joint velocities (rad/s); for each motor the
-physics steps since it is hot, and its last observed torque (N·m).
+number of successive physics steps above HOT, and its last observed torque (N·m).
 """
 WIDTH = sum(ROW.values())
 ACTIONS = 8
@@ -88,8 +88,8 @@ class Solver:
     Attributes:
       iterations: iterations of the constraint solver; pybullet_envs has 60, too.
       self_collision: whether legs collide with each other and the body, as in pybullet_envs.
-      cone: whether friction cones are round, as in pybullet_envs. Without them a turned replay
-        stays close to the record for longer.
+      cone: whether friction cones are round, as in pybullet_envs. Without round cones, a rotated
+        replay stays close to the record for longer.
     """
 
     iterations: int = 60
