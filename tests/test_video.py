@@ -502,7 +502,9 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     for other in ("test-of-others", "no run", *(p.name for p in tmp_path.glob("point/exp*"))):
         with pytest.raises(BadInput, match=r"done\.json|controller"):
             video.render_run(tmp_path / "point" / other, robot=Drawn())
-    assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
+    assert (
+        beside["title"] == "RS, point" and "no gif: MuJoCo cannot render" in capsys.readouterr().err
+    )
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
     main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)
     assert inside((tmp_path / "again.html").read_text()) == beside  # found by its run alone
