@@ -184,7 +184,7 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
     one, again = written["methods"].values()
     assert one == again and one["runs"] == 2 and len(one["reached"]) == 5
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
-    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
+    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 reached all waypoints")
     for wrong, robots, why in (((), 1, "of a run"), (runs, 0, "robots must")):
         with pytest.raises(BadInput, match=why):
             waypoints.main(wrong, robots=robots, out=tmp_path)

@@ -132,7 +132,7 @@ def test_ctrl_c_while_a_command_is_read_in_is_a_sentence(tmp_path: Path) -> None
         f"import sys, runpy; sys.path.insert(0, {str(tmp_path)!r}); sys.argv = ['-m']; "
         "runpy.run_module('experiments.ant_lr', run_name='__main__', alter_sys=False)"
     )
-    said = "stopped: nothing had begun\n"
+    said = "stopped before the command began\n"
     assert interrupted(["-c", stand_in], True, 0.0) == (130, said)
 
 

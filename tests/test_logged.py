@@ -74,7 +74,7 @@ def test_a_goal_horizon_that_leaves_little_is_said() -> None:
 
 def test_what_is_told_of_other_sizes_is_refused() -> None:
     for s, way in (((7,), (2,)), ((7,), (1,)), ((6,), (3,)), ((2, 7), (3,))):
-        with pytest.raises(BadInput, match=r"s \[..., 7\] and a way \[..., 3\]"):
+        with pytest.raises(BadInput, match=r"s \[..., 7\] and a relative goal \[..., 3\]"):
             Mine().check_inputs(np.zeros(s), np.zeros(way))
 
 
@@ -110,7 +110,7 @@ def test_a_log_without_episodes_is_refused() -> None:
 def test_nothing_can_be_stepped() -> None:
     robot = Mine()
     for call in (robot.reset, robot.step, robot.set_state, robot.cost):
-        with pytest.raises(BadInput, match="known by its logs alone"):
+        with pytest.raises(BadInput, match="it has logs, but no simulator"):
             call(None, None)
 
 
