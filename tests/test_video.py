@@ -434,7 +434,7 @@ REFUSED: list[tuple[str, dict, str]] = [
     ("a.mp4", {"width": 10**6}, "width must be at most 8192"),
     ("a.gif", {"height": -3}, "height must be at least 16"),
     ("file/a.gif", {}, "cannot use .*file/a.gif"),
-    ("folder.html", {}, "folder.html: Is a directory"),
+    ("folder.html", {}, "a directory, not a file"),
     (f"{'x' * 300}.mp4", {}, "File name too long"),
     ("proc/a.html", {}, "cannot use"),
 ]
@@ -463,7 +463,7 @@ def test_what_cannot_be_written_is_refused_before_there_is_a_film(
 
 def test_checking_leaves_no_file(tmp_path: Path) -> None:
     shot = video.check(str(tmp_path / "new" / "a.html"), width=99)  # and a str is a path
-    assert shot.width == 99 and [p.name for p in tmp_path.rglob("*")] == ["new"]
+    assert shot.width == 99 and not [*tmp_path.rglob("*")]
 
 
 def test_a_command_refuses_in_one_sentence(
