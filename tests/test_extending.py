@@ -254,7 +254,7 @@ def test_a_name_is_given_once(toy: type[MujocoRobot], loop: type[Engine]) -> Non
 
 @pytest.mark.parametrize("name", ["", "a/b", "two words", "../up", None, 3])
 def test_a_name_that_cannot_stand_in_a_path_is_refused(name: Any) -> None:
-    with pytest.raises(BadInput, match="^the name of (a robot|Kind) must "):
+    with pytest.raises(BadInput, match=r"^the name of (a robot|Kind) must "):
         robots.register(type("Kind", (MujocoRobot,), {"name": name}))
     engine = type("Kind", (ENGINES["mujoco"],), {"name": name})
     with pytest.raises(BadInput, match=r"^the name of Kind must be an identifier, not "):

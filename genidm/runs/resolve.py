@@ -118,12 +118,8 @@ def who_set_what(
     Returns:
       a line each for what is chosen, what the user set, and what differs from the paper.
     """
-    inverse = isinstance(given, InverseDynamics) and given.name == method.name
-    papers = paper_settings(given) if inverse else given
-        paper_settings(method)
-        if isinstance(method, InverseDynamics) and given.name == method.name
-        else given
-    )
+    ours = isinstance(given, InverseDynamics) and given.name == method.name
+    papers = paper_settings(given) if ours else given
     lines = []
     for who, before, after in (
         ("chosen for this scale and machine", method, chosen),
