@@ -88,7 +88,7 @@ def _write_alone(
     drawn = _draw(directory, prefix, rows, shown, TABLE1.get(written["robot"]))
     text = f"{table.text(written)}\n\nFigures in {directory}: {', '.join(drawn)}"
     if not shown.changes:
-        text += "\nNo figure of invariance: no record lies here to draw states from."
+        text += "\nNo invariance figure: there is no record to sample states from."
     files.save_text(directory / f"{prefix}table.txt", f"{text}\n")
 
 

@@ -129,7 +129,7 @@ def who_set_what(
     for who, before, after in (
         ("chosen for this scale and machine", method, chosen),
         ("set by you", chosen, given),
-        ("differs from the paper (--paper-settings uses its values)", papers, given),
+        ("unlike the paper (see --paper-settings)", papers, given),
     ):
         changes = [c for c in differences(before, after) if not c.startswith("name ")]
         if changes:

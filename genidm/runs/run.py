@@ -150,7 +150,7 @@ class Run(abc.ABC, Generic[M]):
         return self._stage(f"{kind}-{self._label}", config, *code)
 
     def run_test(self, scenarios: Scenarios, kind: str = "test") -> Stage:
-        """Runs the test (A.1.3) and the trajectories of Fig. 8; returns the finished `test_stage`."""
+        """Runs the test (A.1.3) and the episodes of Fig. 8; returns the finished `test_stage`."""
         stage = self.test_stage(scenarios, kind)
         stage.run_once(lambda: self._tested(stage, scenarios))
         return stage
