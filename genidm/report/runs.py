@@ -105,7 +105,7 @@ class Runs:
         return [self.root / name for name in sorted(names) if Stage(self.root / name).done]
 
     def last_chunk(self) -> Path | None:
-        """The last chunk of the record of the lowest row that has one on disk; None if no row has."""
+        """The last chunk of the record of the lowest row that has one on disk, or None."""
         for tests in reversed(self.found.values()):
             stage = tests[0].summary.get("experience")
             chunks = sorted(self.root.glob(f"{stage}/experience/chunk_*")) if stage else []
