@@ -185,7 +185,7 @@ def _restore(path: Path, like: Any) -> Any:
 
     wanted, record = trees.named(like), files.load_json(path / "leaves.json")
     if differs := trees.difference(record["kinds"], trees.kinds(like)):
-        difference = "{} is {} there, {} here".format(*differs)
+        difference = "{} is {} in the checkpoint, {} in this run".format(*differs)
         raise BadInput(f"{path} is a checkpoint of another robot or setting: {difference}")
     tree = (path / "tree").absolute()
     with files.disk(path):

@@ -27,7 +27,9 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
         invalid, or the file cannot be written.
     """
     if robot.name not in ROWS and not isinstance(robot, MujocoRobot):
-        raise BadInput(f"there are rows for robots with a MuJoCo model, not for the {robot.name}")
+        raise BadInput(
+            f"the benchmark has rows for robots with a MuJoCo model, not for {robot.name}"
+        )
     rows, out = choose(options.rows, ROWS.get(robot.name, OTHERS)), place(robot, options)
     for lanes in (options.num_envs, options.wide):
         if lanes % robot.mesh().size:

@@ -29,7 +29,7 @@ def baseline(bench: Bench) -> Probe:
 
 
 def envpool(bench: Bench, *, wide: bool = False) -> Probe:
-    """EnvPool's Ant-v5 with random actions, drawn before; one thread per core.
+    """EnvPool's Ant-v5 with random actions drawn in advance; one thread per core.
 
     It steps gymnasium's model, not ours. Both make 5 physics steps per control step, but
     gymnasium's integrator is RK4, which computes the dynamics four times per physics step (our

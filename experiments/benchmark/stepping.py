@@ -24,7 +24,7 @@ STEPS = 32
 
 
 def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Probe:
-    """Only `mujoco.batch`, with random actions drawn before.
+    """Only `mujoco.batch`, with random actions drawn in advance.
 
     Args:
       bench: sizes.
@@ -59,7 +59,7 @@ def step_batch(robot: MujocoRobot, simulations: Batch, actions: np.ndarray) -> N
 def stepping(
     bench: Bench, *, engine: str | None = None, wide: bool = False, count: int | None = None
 ) -> Probe:
-    """Only `robot.step`, with random actions drawn before.
+    """Only `robot.step`, with random actions drawn in advance.
 
     Args:
       bench: sizes.

@@ -48,7 +48,7 @@ class Probe(NamedTuple):
 
 
 def stepping(robot: Robot, lanes: int) -> Probe:
-    """Only `robot.step`, with random actions drawn before."""
+    """Only `robot.step`, with random actions drawn in advance."""
     mesh = robot.mesh()
     state = devices.put(_standing(robot, lanes), mesh)
     actions = devices.put(_actions(robot, lanes), mesh, 1)

@@ -146,7 +146,7 @@ def _finished(
     done = sorted(
         root.glob(f"test-*/{DONE}"), key=lambda path: (path.parent in own, path.stat().st_mtime)
     )
-    asked = (scale, to_json(settings), robot.engine_name)
+    wanted = (scale, to_json(settings), robot.engine_name)
     for path in done:
         try:
             summary = files.load_json(path)
@@ -155,7 +155,7 @@ def _finished(
             # One file of an older version, or of another program, must not prevent the report.
             print(f"warning: {path} is not the summary of a test; left out", file=sys.stderr)
             continue
-        if found == asked:
+        if found == wanted:
             yield Tested(path.parent, summary)
 
 
