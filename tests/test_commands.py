@@ -48,7 +48,7 @@ def test_the_method_with_paper_settings_is_the_papers() -> None:
         this.fit.cosine_decay,
     )
     assert kept == ("episodes", 0.25, True, False)
-    with pytest.raises(BadInput, match="letter"):
+    with pytest.raises(BadInput, match="changes nothing"):
         make_run(Point(), methods.VGCP, Options(paper_settings=True))
 
 
