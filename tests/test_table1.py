@@ -248,7 +248,7 @@ def test_without_a_record_there_is_no_figure_of_invariance(copy: Path) -> None:
     assert report and not failures
     names = {path.name for path in report.glob("*.png")}
     assert not names & {"invariance.png", "collecting.png"} and "paths.png" in names
-    assert "no record lies here" in (report / "table.txt").read_text()
+    assert "there is no record" in (report / "table.txt").read_text()
     found = json.loads((report / "results.json").read_text())["methods"]
     assert not any("invariance" in method for method in found.values())
 
