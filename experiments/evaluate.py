@@ -1,4 +1,4 @@
-"""Tests saved controllers again: `python -m experiments.evaluate runs/ant/LR-0-…`."""
+"""Tests saved controllers: `python -m experiments.evaluate runs/ant/LR-0-…`."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def main(
     engine: str | None = None,
     test: EvaluationSettings = EvaluationSettings(),
 ) -> None:
-    """The paper's test (A.1.3) of controllers, on as many scenarios as you like; keeps nothing.
+    """Tests controllers as in the paper (A.1.3), prints a table, and writes no files.
 
     Args:
-      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --run-dir.
-      seeds: test seeds.
-      episodes: episodes a seed.
-      first_seed: the first of the test seeds; another one gives unseen scenarios.
-      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
+      runs: directories of fits or baselines (METHOD-SEED-…) under --run-dir.
+      seeds: number of test seeds.
+      episodes: episodes per test seed.
+      first_seed: the first test seed; another value gives unseen scenarios.
+      engine: "mjx" or "mujoco"; default: MJX on an accelerator, MuJoCo in C on a CPU.
       test: settings of the test.
 
     Raises:
-      BadInput: runs of different robots, or none.
+      BadInput: no runs, or runs of different robots.
     """
     robot, models = saved(runs, engine)
     test_scenarios, rows = scenarios(robot, seeds, episodes, first_seed), []
@@ -44,8 +44,8 @@ def main(
     for name, (model, fitted) in models.items():
         outcome = evaluate(robot, model, test_scenarios, test)
         sanity.walked(name, outcome)
-        told = {key: fitted[key] for key in ("interactions", "replayed", "settings")}
-        rows.append(Row(method=name, episodes=outcome, made={"test": tested}, **told))
+        reported = {key: fitted[key] for key in ("interactions", "replayed", "settings")}
+        rows.append(Row(method=name, episodes=outcome, made={"test": tested}, **reported))
     written = results(
         rows,
         robot=robot.name,
@@ -57,4 +57,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_cli(main, "Tests saved controllers again.")
+    run_cli(main, "Tests saved controllers.")

@@ -1,8 +1,8 @@
 """The harder problem, velocities in the world's frame: `python -m experiments.humanoid_world`.
 
-What PyBullet tells of a humanoid's velocity is turned by the yaw already, which takes from LFM
-some of what it is to learn. Here the same record is read with the velocity as the world has it:
-the same walks, the same actions, the same 𝒢, another s.
+PyBullet's velocity of the Humanoid is in the heading frame, so it is already invariant to the
+yaw. Here the same experience has the velocity in the world's frame, so the LFM has to learn this
+invariance: the same episodes, actions and 𝒢, another s.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ METHODS = ("RL", "GE", "LR")
 
 
 def in_world(s: np.ndarray) -> np.ndarray:
-    """Humanoid states `[..., 43]` as HumanoidWorld has them.
+    """Converts states `[..., 43]` of the Humanoid to those of HumanoidWorld.
 
-    Turned so that it faces +x a robot reads the same in both frames; turned back, its velocity
-    goes with it in one of them.
+    At yaw 0 the two states are equal. So each state is rotated to yaw 0 as the Humanoid's, and
+    back as HumanoidWorld's.
     """
     heading, world, x = Humanoid().observation, HumanoidWorld().observation, jnp.asarray(s)
     yaw = heading.yaw(x)
@@ -37,7 +37,7 @@ def in_world(s: np.ndarray) -> np.ndarray:
 
 
 def record(options: table1.Table) -> Experience:
-    """The Humanoid's record in the place of HumanoidWorld's; collected, unless it is there."""
+    """Stores the Humanoid's experience, converted, as HumanoidWorld's; collects it if missing."""
     lr = by_name("LR", Humanoid.name)
     source, target = (
         make_run(robot(engine=options.engine), lr, options) for robot in (Humanoid, HumanoidWorld)
@@ -46,9 +46,9 @@ def record(options: table1.Table) -> Experience:
     stage = target.experience_stage
 
     def work() -> dict[str, Any]:
-        seen = source.experience()
-        seen = seen.replace(s=in_world(seen.s))
-        seen.save(stage.path("experience") / "chunk_00000", overwrite=True)
+        experience = source.experience()
+        converted = experience.replace(s=in_world(experience.s))
+        converted.save(stage.path("experience") / "chunk_00000", overwrite=True)
         return source.experience_stage.summary()
 
     stage.run_once(work)
@@ -58,7 +58,7 @@ def record(options: table1.Table) -> Experience:
 def main(
     options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),
 ) -> None:
-    """Reads the Humanoid's record in the world's frame, then runs the methods on it."""
+    """Converts the Humanoid's experience to the world's frame and runs the methods on it."""
     record(options)
     table1.table1(dataclasses.replace(options, robot=HumanoidWorld.name))
 

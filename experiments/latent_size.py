@@ -1,4 +1,4 @@
-"""Fig. 9, closest distance against the size k: `python -m experiments.latent_size`."""
+"""Fig. 9, closest distance against latent size k: `python -m experiments.latent_size`."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from genidm.runs.command import run_cli
 from genidm.runs.resolve import Options
 from genidm.runs.run import InverseDynamicsRun
 
-KIND = "latent_size"  # of the tests, which are no rows of the table
+KIND = "latent_size"  # of these tests, so that Table 1 does not show them
 
 
 @dataclasses.dataclass(frozen=True)
 class Sweep(Options):
-    """What the figure takes.
+    """Settings of the figure.
 
     Attributes:
-      episodes: test episodes a seed.
-      robot: by its name.
-      sizes: k, one point each.
-      repeats: independent fits of each k, to the same pairs.
+      episodes: test episodes per test seed.
+      robot: name of the robot.
+      sizes: the latent sizes k.
+      repeats: independent fits for each k, to the same pairs.
     """
 
     episodes: int | None = 200
@@ -46,11 +46,11 @@ class Sweep(Options):
 
     def __post_init__(self) -> None:
         if self.repeats < 1 or not self.sizes or min(self.sizes) < 1:
-            raise BadInput("the figure needs repeats, and sizes, of at least 1")
+            raise BadInput("repeats and sizes must be at least 1")
 
 
 def sized(method: InverseDynamics, k: int) -> InverseDynamics:
-    """The method with a latent of another size, under a name of its own."""
+    """The method with latent size k; if that is not its own, the name says so."""
     if k == method.fit.latent_size:
         return method
     fit = dataclasses.replace(method.fit, latent_size=k)
@@ -60,7 +60,7 @@ def sized(method: InverseDynamics, k: int) -> InverseDynamics:
 def cells(
     robot: Robot, method: InverseDynamics, options: Sweep
 ) -> dict[int, list[InverseDynamicsRun]]:
-    """k → its cells, one a fit. The first fit with the method's own k is that of Table 1."""
+    """Latent size k → its runs, one per fit. Table 1 shares the first fit of the method's own k."""
     found: dict[int, list[InverseDynamicsRun]] = {}
     for k in sorted(set(options.sizes)):
         this = make_run(robot, sized(method, k), options)
@@ -70,22 +70,22 @@ def cells(
 
 
 def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
-    """Fits and tests every k that is not done; then writes the numbers and the figure.
+    """Fits and tests every k that is not finished; then writes the numbers and the figure.
 
     Args:
-      robot: whose experience it is; shared with Table 1.
-      method: LR, or one like it.
-      options: sizes, repeats, scale, places.
+      robot: the robot; Table 1 shares its experience.
+      method: a method with a latent, such as LR.
+      options: settings of the figure.
 
     Returns:
       the directory of the results.
     """
-    of = cells(robot, method, options)
+    runs = cells(robot, method, options)
     announce(robot, options.engine)
-    first = next(iter(of.values()))[0]
+    first = next(iter(runs.values()))[0]
     scenarios = scenarios_of(first, options)
     tests = {
-        k: [tested(this, scenarios, options.video) for this in these] for k, these in of.items()
+        k: [tested(this, scenarios, options.video) for this in these] for k, these in runs.items()
     }
     written = document(first, method, scenarios, tests)
     here = first.root / f"{KIND}-{first.scale.name}"
@@ -100,7 +100,7 @@ def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
 
 
 def tested(this: InverseDynamicsRun, scenarios: Scenarios, video: bool) -> Episodes:
-    """A fit's test, made unless it is there, and its video, if that is asked for."""
+    """Runs a fit's test if it is not finished, renders it if `video`; returns its episodes."""
     stage = this.run_test(scenarios, KIND)
     if video:
         render_run(this)
@@ -116,8 +116,8 @@ def document(
     """The figure as one JSON document, distances in metres.
 
     Returns:
-      robot, scale, training_seed, scenarios, experience, settings, versions, hardware; sizes:
-      k → `stats.spread` over its fits, and fits: `stats.summary` of each one's test.
+      robot, scale, training_seed, scenarios, experience, settings, versions, hardware; and
+      sizes: k → `stats.spread` over its fits, with fits: `stats.summary` of each fit's test.
     """
     found = environment()
     return {
@@ -134,13 +134,13 @@ def document(
 
 
 def size(fits: list[Episodes]) -> dict[str, Any]:
-    """A point of the figure: over all fits, and each of them."""
+    """The numbers of one k: over all its fits, and of each fit."""
     return {**stats.spread(fits), "fits": [stats.summary(fit) for fit in fits]}
 
 
 def text(written: dict[str, Any]) -> str:
     """The numbers for a terminal."""
-    lines = [f"{written['robot']}, scale {written['scale']}: closest distance in metres against k"]
+    lines = [f"{written['robot']}, scale {written['scale']}: closest distance in metres, by k"]
     for k, point in written["sizes"].items():
         means, (low, high) = point["means"], point["fits"][0]["ci95"]
         fits = f"± {metres(point['std'])} over fits: {', '.join(map(metres, means))}"
@@ -150,12 +150,12 @@ def text(written: dict[str, Any]) -> str:
 
 
 def metres(value: float | None) -> str:
-    """To a millimetre; a dash where every episode diverged."""
+    """Formats metres to a millimetre; a dash if every episode diverged."""
     return "–" if value is None else f"{value:.3f}"
 
 
 def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> None:
-    """Fits, tests, and prints the numbers."""
+    """Fits and tests all sizes, and prints the numbers."""
     robot = by_name(options.robot, options.engine)
     print((run(robot, LR, options) / "table.txt").read_text(encoding="utf-8"))
 

@@ -1,10 +1,9 @@
-"""The Minitaur in PyBullet: what its settings cost, how it walks under them, how turnable it is.
+"""The Minitaur in PyBullet: speed, gait and equivalence modulo orientation, by solver settings.
 
-    python -m experiments.minitaur_physics         # minutes; what it says is in docs/physics.md
+    python -m experiments.minitaur_physics         # minutes; docs/physics.md shows the results
     python -m experiments.minitaur_physics --num-envs 4
 
-Speeds of a single robot are in CPU time; those of several processes are
-`experiments.minitaur_processes`'.
+Speeds of one robot are in CPU time. `experiments.minitaur_processes` measures several processes.
 """
 
 from __future__ import annotations
@@ -44,19 +43,19 @@ ORIGINAL = Solver(iterations=60, self_collision=True, cone=True)
 OURS = Solver()
 STEPS = 500
 LOOK = (5, 10, 20, 50, 100, 200, 500)
-# Each is shaken for so many control steps before it walks, so that no two walk alike.
+# Random control steps before the gait, so that all robots walk differently.
 SHAKEN = 5
-# Runs of which the shortest is taken.
+# Repetitions of a timing; the shortest counts.
 REPEATS = 10
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is measured.
+    """Settings of the measurement.
 
     Attributes:
-      num_envs: robots that a number is the mean or the median of.
-      seed: of shakes, actions and yaws.
+      num_envs: number of robots; results are means or medians over them.
+      seed: of random actions and yaws.
       out: the JSON file.
     """
 
@@ -65,27 +64,27 @@ class Options:
     out: Path | str = Path("experiments/results/minitaur_physics.json")
 
     def check(self) -> None:
-        """Raises BadInput for what cannot be measured."""
+        """Raises BadInput if a setting is invalid."""
         if self.num_envs < 1:
             raise BadInput("--num-envs must be at least 1")
 
 
 def gait() -> np.ndarray:
-    """Actions `[STEPS, 8]` of a trot at 2 Hz: 0.2 m/s, and it does not fall."""
+    """Actions `[STEPS, 8]` of a trot at 2 Hz; it walks at 0.2 m/s without a fall."""
     phase = 2 * np.pi * 2 * 0.01 * np.arange(STEPS)[:, None] + np.pi * np.array([0, 1, 1, 0])
     return np.concatenate([0.3 * np.sin(phase), 0.2 * np.cos(phase) - 0.3], axis=-1)
 
 
 def shakes(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """Actions `[steps, 8]`, uniform."""
+    """Random actions `[steps, 8]`, uniform in [−1, 1]."""
     return rng.uniform(-1, 1, (steps, ACTIONS))
 
 
-# ── jobs, each in a process of its own ──────────────────────────────────────────────────────
+# ── jobs for worker processes ───────────────────────────────────────────────────────────────
 
 
 class OneByOne(Simulation):
-    """Asks and tells Bullet joint by joint, as pybullet_envs does."""
+    """Reads and commands the joints with one call per joint, as pybullet_envs does."""
 
     def _joints(self, joints: list[int]) -> np.ndarray:
         states = [self.bullet.getJointState(self.body, j)[:2] for j in joints]
@@ -99,14 +98,14 @@ class OneByOne(Simulation):
 
 
 def hard(solver: Solver, yaw: float, actions: np.ndarray) -> np.ndarray:
-    """o `[T, 3]` after each of the actions, from a hard reset at `yaw`, never placed."""
+    """o `[T, 3]` after each action, from a hard reset at `yaw`, without `set_state`."""
     simulation = Simulation(solver)
     simulation.reset(yaw)
     return np.array([live(simulation, action)[:3] for action in actions])
 
 
 def placed(solver: Solver, row: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """o `[T, 3]` after each of the actions, as 𝒢 has it: placed anew in float32 at each step."""
+    """o `[T, 3]` after each action, as in 𝒢: `set_state` in float32 before every step."""
     simulation, positions = Simulation(solver), []
     for action in actions:
         row = again(simulation, action, row)
@@ -115,23 +114,29 @@ def placed(solver: Solver, row: np.ndarray, actions: np.ndarray) -> np.ndarray:
 
 
 def live(simulation: Simulation, action: np.ndarray) -> np.ndarray:
-    """The row after a step of a simulation that goes on."""
+    """The row after a step from the simulation's current state."""
     simulation.step(action)
     return simulation.read()
 
 
 def again(simulation: Simulation, action: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """The row after a step of a simulation that is placed first."""
+    """The row after `set_state` to `row` and a step."""
     return stepped(simulation, np.concatenate([row, action]).astype(np.float32))
 
 
 def settled(solver: Solver) -> np.ndarray:
-    """The row of the settled start."""
+    """The row of the settled initial state."""
     return Simulation(solver).read()
 
 
 def walk(solver: Solver, anew: bool, seed: int) -> list[float]:
-    """One walk: metres ahead, mean height (m), mean pitch (rad), steps until it fell, ms a step."""
+    """Walks once: metres ahead, mean height (m), mean pitch (rad), steps until a fall, ms per step.
+
+    Args:
+      solver: settings of Bullet.
+      anew: whether the state is set before every step.
+      seed: of the random steps before the gait.
+    """
     simulation, rng = Simulation(solver), np.random.default_rng(seed)
     for action in 0.3 * shakes(rng, SHAKEN):
         simulation.step(action)
@@ -150,7 +155,7 @@ def walk(solver: Solver, anew: bool, seed: int) -> list[float]:
 
 
 def cost(solver: Solver, batched: bool) -> float:
-    """ms of CPU that a control step of a walking robot takes."""
+    """CPU time of a control step of a walking robot, ms; `batched`: one call for all joints."""
     simulation = (Simulation if batched else OneByOne)(solver)
     began = time.process_time()
     for action in gait()[:100]:
@@ -159,7 +164,7 @@ def cost(solver: Solver, batched: bool) -> float:
 
 
 class Jobs:
-    """Functions of this module run on all cores, each job in a process that PyBullet may fill."""
+    """Runs functions of this module on all cores, in worker processes."""
 
     def __init__(self) -> None:
         self._pool = ProcessPoolExecutor(devices.cores(), get_context("spawn"))
@@ -171,7 +176,7 @@ class Jobs:
         self._pool.shutdown()
 
     def __call__(self, job: Callable[..., Any], *columns: Any) -> np.ndarray:
-        """Results `[n, ...]` of n jobs, whose arguments stand in columns."""
+        """Results `[n, ...]` of n jobs; each column holds one argument of all jobs."""
         return np.array(list(self._pool.map(job, *columns)))
 
 
@@ -179,17 +184,17 @@ class Jobs:
 
 
 def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
-    """How far a turned replay is from the replay, turned: a row for each start, cone and action."""
+    """Distance of replays from rotated starts to rotated replays: a row per cone, start, action."""
     rng, rows = np.random.default_rng(options.seed), []
     yaw = rng.uniform(-np.pi, np.pi, options.num_envs)
-    told = {
+    commands = {
         "trot": [gait()] * options.num_envs,
         "random": [shakes(rng, STEPS) for _ in range(options.num_envs)],
     }
     for cone in (False, True):
         solver = [dataclasses.replace(OURS, cone=cone)] * options.num_envs
         for start in ("hard reset", "placed"):
-            for name, actions in told.items():
+            for name, actions in commands.items():
                 straight, turned = replays(jobs, start, solver, yaw, actions)
                 exact = symmetry.rotate_vector(jnp.asarray(straight), jnp.asarray(yaw)[:, None])
                 apart = np.linalg.norm(np.asarray(exact) - turned, axis=-1)[:, np.array(LOOK) - 1]
@@ -205,7 +210,7 @@ def drift(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
 def replays(
     jobs: Jobs, start: str, solver: list[Solver], yaw: np.ndarray, actions: list[np.ndarray]
 ) -> Iterator[np.ndarray]:
-    """o `[lanes, T, 3]`, from yaw 0 and from `yaw [lanes]`."""
+    """o `[lanes, T, 3]` of two replays: from yaw 0 and from `yaw [lanes]`."""
     if start == "hard reset":
         return (jobs(hard, solver, way, actions) for way in (0 * yaw, yaw))
     row = jobs(settled, solver[:1])[0]
@@ -231,7 +236,7 @@ WALKERS = {
 
 
 def fidelity(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
-    """The same walk under other settings: mean and standard error over the lanes."""
+    """The same gait with different settings: mean and standard error over the lanes."""
     rows, names = [], ("ahead", "height", "pitch", "steps", "ms")
     seeds = [options.seed + lane for lane in range(options.num_envs)]
     for name, (solver, anew) in WALKERS.items():
@@ -243,9 +248,9 @@ def fidelity(jobs: Jobs, options: Options) -> list[dict[str, Any]]:
 
 
 def calls(jobs: Jobs) -> list[dict[str, Any]]:
-    """ms of CPU a control step: batched calls on and off, self-collision on and off.
+    """CPU time (ms) of a control step, with and without batched calls and self-collision.
 
-    The least of some runs, which take turns, one at a time: other load can but add to it.
+    The minimum over REPEATS alternating runs, one at a time, because other load only adds time.
     """
     kinds = [(collides, batched) for collides in (True, False) for batched in (False, True)]
     engines = [dataclasses.replace(OURS, self_collision=collides) for collides, _ in kinds]
@@ -266,7 +271,7 @@ def calls(jobs: Jobs) -> list[dict[str, Any]]:
 
 
 def drift_table(rows: list[dict[str, Any]]) -> str:
-    """Median (90th percentile), metres."""
+    """Markdown table of drift: median (90th percentile), metres."""
     lines = []
     for r in rows:
         cells = [f"{metres(m)} ({metres(p)})" for m, p in zip(r["median"], r["p90"], strict=True)]
@@ -276,7 +281,7 @@ def drift_table(rows: list[dict[str, Any]]) -> str:
 
 
 def fidelity_table(rows: list[dict[str, Any]]) -> str:
-    """Means ± standard errors."""
+    """Markdown table of gaits: means ± standard errors."""
     digits = {"ahead": 3, "height": 4, "pitch": 4, "steps": 0, "ms": 2}
 
     def cells(r: dict[str, Any]) -> list[str]:
@@ -288,7 +293,7 @@ def fidelity_table(rows: list[dict[str, Any]]) -> str:
 
 
 def calls_table(rows: list[dict[str, Any]]) -> str:
-    """CPU time by kind of call."""
+    """Markdown table of CPU time, by kind of call."""
     word = {True: "on", False: "off"}
     lines = [[word[r["self_collision"]], word[r["batched"]], f"{r['ms']:.2f}"] for r in rows]
     return table(["self-collision", "batched calls", "ms CPU a step"], lines)
@@ -297,7 +302,7 @@ def calls_table(rows: list[dict[str, Any]]) -> str:
 def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None:
     """Measures, prints the tables and writes the JSON."""
     options.check()
-    Minitaur()  # or says what to install
+    Minitaur()  # raises BadInput if PyBullet is not installed
     before = os.getloadavg()[0]
     results = dict[str, Any]()
     with Jobs() as jobs:
@@ -314,4 +319,4 @@ def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Optio
 
 
 if __name__ == "__main__":
-    run_cli(minitaur_physics, "Speed, fidelity and turnability of the Minitaur in PyBullet.")
+    run_cli(minitaur_physics, "Speed, gait and equivalence modulo orientation of the Minitaur.")

@@ -1,7 +1,7 @@
-"""Minitaurs stepped by several processes: how much faster, and what is lost beside the slowest.
+"""The Minitaur in several processes: speed-up, and overhead over the slowest process.
 
-Rows of `experiments.minitaur_physics`. In wall time, but for the time that a process is ready
-and does not get a core, so other load matters little.
+Part of `experiments.minitaur_physics`. The overhead is wall time relative to the slowest process's
+time on a core or in wait for one, so other load has little influence.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from experiments.physics import table
 from genidm import devices
 from genidm.robots import Minitaur
 
-# Rounds of which the medians are taken, and robot steps of each.
+# Rounds, over which medians are taken, and robot steps per round.
 ROUNDS, ROUND = 5, 2560
 
 
 def busy(pids: list[int]) -> np.ndarray:
-    """Seconds that each process has run, or waited for a core: the kernel's schedstat."""
+    """Seconds `[2, n]` that each process has run, and has waited for a core (schedstat)."""
     stats = [Path(f"/proc/{pid}/schedstat").read_text().split() for pid in pids]
     return np.array([[int(x) for x in s[:2]] for s in stats]).T / 1e9
 
 
 @dataclasses.dataclass(frozen=True)
 class Vectorised:
-    """Robots that processes step together.
+    """Robots that several processes step together.
 
     Attributes:
-      name: of what steps them.
-      num_envs: robots.
-      pids: of the processes.
-      step: steps them all once, and waits for it.
+      name: name in the table.
+      num_envs: number of robots.
+      pids: ids of the processes.
+      step: makes one step of all robots and waits for the result.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Vectorised:
     step: Callable[[], Any]
 
     def measured(self, repeats: int) -> dict[str, float]:
-        """Steps a second of wall, ms of CPU a step, and the share of wall beside the slowest."""
+        """Robot steps per second of wall time, CPU ms per step, and overhead over the slowest."""
         wall = slowest = cpu = 0.0
         for _ in range(repeats):
             before, began = busy(self.pids), time.perf_counter()
@@ -67,13 +67,12 @@ class Vectorised:
 
 
 def vectorised(actions: np.ndarray) -> list[dict[str, Any]]:
-    """A row for 1, 2, 4, … processes, ours and gymnasium's.
+    """A row for each of 1, 2, 4, … processes, ours and gymnasium's.
 
-    Medians over rounds in which all take their turns: what the machine does meanwhile is
-    shared by all.
+    Values are medians over rounds; every round measures all rows, so other load affects all alike.
 
     Args:
-      actions: `[T, 8]`, of robots that walk.
+      actions: `[T, 8]`, of a walking robot.
     """
     counts = [n for n in (1, 2, 4, 8, 16) if n <= devices.cores()]
     with contextlib.ExitStack() as opened:
@@ -88,7 +87,7 @@ def vectorised(actions: np.ndarray) -> list[dict[str, Any]]:
 
 
 def ours(processes: int, actions: np.ndarray, lanes: int = 128) -> Vectorised:
-    """Lanes shared by processes."""
+    """Our Minitaur: lanes distributed over processes."""
     robot = Minitaur(processes=processes)
     step = jax.jit(robot.step)
     state = robot.reset(jax.random.split(jax.random.key(0), lanes), jnp.zeros(lanes))
@@ -103,7 +102,7 @@ def ours(processes: int, actions: np.ndarray, lanes: int = 128) -> Vectorised:
 
 @contextlib.contextmanager
 def gymnasiums(processes: int, actions: np.ndarray) -> Iterator[Vectorised]:
-    """gymnasium's AsyncVectorEnv, an environment a process."""
+    """gymnasium's AsyncVectorEnv, with one environment per process."""
     from gymnasium.vector import AsyncVectorEnv
 
     from genidm.robots.minitaur_env import MinitaurEnv
@@ -119,7 +118,7 @@ def gymnasiums(processes: int, actions: np.ndarray) -> Iterator[Vectorised]:
 
 
 def processes_table(rows: list[dict[str, Any]]) -> str:
-    """Speed, its ratio to one process, and overhead."""
+    """Markdown table of speed, its ratio to one process, and overhead."""
     one = {r["what"]: r["steps_per_second"] for r in rows if r["processes"] == 1}
     lines = [
         [

@@ -1,12 +1,12 @@
-"""How stable, how fast and how turnable a robot's physics is, by solver settings.
+"""Stability, speed and equivalence modulo orientation of a robot's physics, by solver settings.
 
-    python -m experiments.physics                  # minutes; what it says is in docs/physics.md
+    python -m experiments.physics                  # minutes; docs/physics.md shows the results
     python -m experiments.physics --robot humanoid
-    python -m experiments.physics --steps 20000    # a glance
+    python -m experiments.physics --steps 20000    # a quick look
 
-Robots are shaken: every torque is at full strength, forwards or backwards at random, drawn
-anew for each control step. A blow-up is a number that is not finite, a velocity beyond 1000
-(m/s or rad/s), or a reset that MuJoCo in C makes by itself. A robot that blows up starts afresh.
+Actions are random: every torque is at full strength, with a new random sign in every control step.
+A blow-up is a number that is not finite, a velocity beyond 1000 (m/s or rad/s), or an automatic
+reset by MuJoCo in C. A robot is reset after a blow-up.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ SETTINGS = (
 
 
 class Precision(NamedTuple):
-    """An engine, and the dtype of its rows between two control steps.
+    """An engine, and the dtype of its physics between control steps.
 
     Attributes:
-      name: in the tables.
-      engine: its name.
-      dtype: of position, velocity and warm start between two control steps.
+      name: name in the tables.
+      engine: name of the engine.
+      dtype: of position, velocity and warm start between control steps.
     """
 
     name: str
@@ -61,25 +61,25 @@ class Precision(NamedTuple):
 
 UNROUNDED = Precision("C float64 rows", MuJoCo.name, "float64")
 
-# Of the steps asked for, the share that settings other than ours are given.
+# The share of `Options.steps` for settings other than OURS.
 OTHERS = 0.128
-EPISODE = 200
-TOO_FAST = 1e3
-# Control steps before a replay begins, and after which it is compared.
+EPISODE = 200  # control steps
+TOO_FAST = 1e3  # m/s or rad/s
+# Control steps before a replay starts, and after which the replays are compared.
 WARM_UP = 20
 LOOK = (5, 10, 20, 30, 50, 100, 200)
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is measured.
+    """Settings of the measurement.
 
     Attributes:
-      robot: by its name; one with a MuJoCo model.
-      steps: control steps of elliptic 4/8; the other settings are given 0.128 of them.
-      num_envs: robots at once; a multiple of the number of devices.
-      seed: of starts, actions and yaws.
-      out: the JSON file; under experiments/results, unless given.
+      robot: name of a robot with a MuJoCo model.
+      steps: control steps with the setting elliptic 4/8; the other settings get 0.128 of them.
+      num_envs: number of robots; a multiple of the number of devices.
+      seed: of initial states, actions and yaws.
+      out: the JSON file; default: experiments/results/ROBOT_physics.json.
     """
 
     robot: str = "ant"
@@ -89,41 +89,39 @@ class Options:
     out: Path | str | None = None
 
     def check(self) -> None:
-        """Raises BadInput for what cannot be measured."""
+        """Raises BadInput if a setting is invalid."""
         modelled = [name for name, kind in ROBOTS.items() if issubclass(kind, MujocoRobot)]
         if self.robot not in modelled:
-            raise BadInput(
-                f"no robot {self.robot!r} has a MuJoCo model; {', '.join(modelled)} have"
-            )
+            raise BadInput(f"--robot must be {', '.join(modelled)}, not {self.robot!r}")
         if min(self.steps, self.num_envs) < 1:
             raise BadInput("--steps and --num-envs must be at least 1")
-        if self.num_envs % jax.device_count():
-            raise BadInput(f"--num-envs must be a multiple of {jax.device_count()}, one a device")
+        if self.num_envs % (count := jax.device_count()):
+            raise BadInput(f"--num-envs must be a multiple of {count}, the number of devices")
 
     def with_solver(self, solver: Solver, engine: str) -> MujocoRobot:
-        """The robot on that engine, under these settings of the solver."""
+        """Makes the robot with this engine and these solver settings."""
         kind: Any = ROBOTS[self.robot]
         return kind(solver=solver, engine=engine)
 
     def episodes(self, solver: Solver) -> int:
-        """Episodes of every lane: the steps asked for, rounded up."""
+        """Episodes per lane for a setting: its share of `steps`, rounded up."""
         steps = self.steps if solver == OURS else OTHERS * self.steps
         return math.ceil(steps / (self.num_envs * EPISODE))
 
 
 def as_run() -> list[Precision]:
-    """Every engine, with the float32 rows that robots are run with."""
+    """Every engine, with float32 between control steps, as in all experiments."""
     return [Precision(engine.label, name, "float32") for name, engine in ENGINES.items()]
 
 
 def setting(solver: Solver) -> str:
-    """The friction cone, iterations and line searches: "elliptic 4/8"."""
+    """Text for solver settings: friction cone, iterations and line searches, as "elliptic 4/8"."""
     cone = "elliptic" if solver.elliptic else "pyramidal"
     return f"{cone} {solver.iterations}/{solver.line_search}"
 
 
-def strong(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Actions `[..., A]`, each −1 or 1."""
+def full_torques(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Random actions `[..., A]`, each −1 or 1."""
     return jax.random.rademacher(key, shape, dtype=jnp.float32)
 
 
@@ -131,17 +129,17 @@ def strong(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def endure(robot: MujocoRobot, name: str, episodes: int, options: Options) -> dict[str, float]:
-    """Shakes lanes, on the devices that the engine asks for.
+    """Steps a robot with random actions and counts blow-ups, on the engine's own devices.
 
     Returns:
-      `steps` made, `blow_ups` counted, `seconds` taken.
+      `steps` (control steps), `blow_ups` (their number) and `seconds` (wall time).
     """
     mesh = robot.mesh()
     seeds = jax.random.split(jax.random.key(options.seed), episodes)
     lanes = [devices.put(jax.random.split(seed, options.num_envs), mesh) for seed in seeds]
     program = jax.jit(devices.over_lanes(shaken(robot), mesh, [0], 0))
     run = compile_ahead(name, program, lanes[0])
-    run(lanes[0]).block_until_ready()  # the first call also touches fresh memory
+    run(lanes[0]).block_until_ready()  # not timed, because the first call allocates memory
     blow_ups, began = 0, time.perf_counter()
     with Progress(name, episodes * EPISODE * options.num_envs, "steps") as bar:
         for keys in lanes:
@@ -156,10 +154,10 @@ def endure(robot: MujocoRobot, name: str, episodes: int, options: Options) -> di
 
 
 def shaken(robot: MujocoRobot) -> Callable[[jax.Array], jax.Array]:
-    """A function of keys `[B]`: blow-ups `[B]` in an episode from fresh starts."""
+    """A function that maps keys `[B]` to the number of blow-ups `[B]` in an episode."""
 
     def step(state: State, keys: jax.Array) -> tuple[State, jax.Array]:
-        after = robot.step(state, jax.vmap(strong, (0, None))(keys, (robot.action.size,)))
+        after = robot.step(state, jax.vmap(full_torques, (0, None))(keys, (robot.action.size,)))
         lost = after.diverged | (jnp.abs(after.physics.qvel) > TOO_FAST).any(-1)
         return select(lost, robot.reset(keys, jnp.zeros(keys.shape)), after), lost
 
@@ -172,7 +170,7 @@ def shaken(robot: MujocoRobot) -> Callable[[jax.Array], jax.Array]:
 
 
 def stability(options: Options) -> list[dict[str, Any]]:
-    """A row for each setting and engine."""
+    """Measures stability and speed: a row for each setting and engine."""
     rows = []
     for solver in SETTINGS:
         for precision in as_run():
@@ -185,13 +183,13 @@ def stability(options: Options) -> list[dict[str, Any]]:
     return rows
 
 
-# ── what is left of equivalence modulo orientation ──────────────────────────────────────────
+# ── equivalence modulo orientation ──────────────────────────────────────────────────────────
 
 
 def walked(
     robot: MujocoRobot, physics: Physics, yaw: jax.Array, actions: jax.Array
 ) -> tuple[Physics, jax.Array]:
-    """Physics `[B, ...]` after actions `[T, B, A]` from a turned start, and o `[T, B, 3]`."""
+    """Physics `[B, ...]` after actions `[T, B, A]` from a rotated state, and o `[T, B, 3]`."""
 
     def step(state: State, action: jax.Array) -> tuple[State, jax.Array]:
         state = robot.step(state, action)
@@ -202,12 +200,12 @@ def walked(
 
 
 def starts(options: Options) -> Physics:
-    """Physics `[B, ...]` of robots that have been shaken for a second, in float32's numbers."""
+    """Physics `[B, ...]` after WARM_UP random control steps, in float32."""
     robot = options.with_solver(OURS, MuJoCo.name)
     fresh, shakes = jax.random.split(jax.random.key(options.seed))
     still = jnp.zeros(options.num_envs)
     state = robot.reset(jax.random.split(fresh, options.num_envs), still)
-    actions = strong(shakes, (WARM_UP, options.num_envs, robot.action.size))
+    actions = full_torques(shakes, (WARM_UP, options.num_envs, robot.action.size))
     shake = jax.jit(functools.partial(walked, robot))
     return jax.tree.map(np.asarray, shake(state.physics, still, actions)[0])
 
@@ -215,7 +213,7 @@ def starts(options: Options) -> Physics:
 def drift(
     robot: MujocoRobot, dtype: str, start: Physics, yaw: np.ndarray, actions: np.ndarray
 ) -> np.ndarray:
-    """Metres `[T, B]` between the replay of the turned start and the turned replay, in `dtype`."""
+    """Metres `[T, B]` between the replay from the rotated start and the rotated replay."""
 
     def walk(physics: Physics, yaw: jax.Array, actions: jax.Array) -> jax.Array:
         return walked(robot, physics, yaw, actions)[1]
@@ -228,7 +226,7 @@ def drift(
 
 
 def drifts(options: Options) -> list[dict[str, Any]]:
-    """A row for each cone and precision: median and 90th percentile over the lanes."""
+    """Measures drift: for each cone and precision, median and 90th percentile over the lanes."""
     start, rng = starts(options), np.random.default_rng(options.seed + 1)
     yaw = rng.uniform(-np.pi, np.pi, options.num_envs)
     rows = []
@@ -236,7 +234,7 @@ def drifts(options: Options) -> list[dict[str, Any]]:
         for precision in (*as_run(), UNROUNDED):
             robot = options.with_solver(solver, precision.engine)
             shape = (max(LOOK), options.num_envs, robot.action.size)
-            actions = np.asarray(strong(jax.random.key(options.seed + 2), shape))
+            actions = np.asarray(full_torques(jax.random.key(options.seed + 2), shape))
             apart = drift(robot, precision.dtype, start, yaw, actions)[np.array(LOOK) - 1]
             rows.append(
                 {
@@ -254,12 +252,12 @@ def drifts(options: Options) -> list[dict[str, Any]]:
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
-    """Markdown."""
+    """A Markdown table."""
     return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
 
 
 def stability_table(rows: list[dict[str, Any]]) -> str:
-    """Blow-ups and speed."""
+    """Markdown table of blow-ups and speed."""
     head = ["cone, iterations/line searches", "engine", "env steps", "blow-ups", "env steps/s"]
     numbers = ("steps", "blow_ups", "steps_per_second")
     return table(
@@ -268,7 +266,7 @@ def stability_table(rows: list[dict[str, Any]]) -> str:
 
 
 def drift_table(rows: list[dict[str, Any]]) -> str:
-    """Median (90th percentile), metres."""
+    """Markdown table of drift: median (90th percentile), metres."""
 
     def cells(row: dict[str, Any]) -> list[str]:
         pairs = zip(row["median"], row["p90"], strict=True)
@@ -281,7 +279,7 @@ def drift_table(rows: list[dict[str, Any]]) -> str:
 
 
 def metres(x: float) -> str:
-    """Two digits where they can be seen, the order of magnitude where not."""
+    """Formats metres: two digits from 0.01 m on, below it one digit and an exponent."""
     return f"{x:.2g}" if x >= 0.01 else f"{x:.0e}"
 
 
@@ -293,7 +291,7 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
     results = {
         "options": options,
         "engines": {p.name: str(options.with_solver(OURS, p.engine).engine) for p in as_run()},
-        # Timings of a machine that does other things beside are only indicative.
+        # Under other load the timings are only indicative.
         "load": [before, os.getloadavg()[0]],
         "stability": stable,
         "drift": turned,
@@ -305,4 +303,4 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
 
 
 if __name__ == "__main__":
-    run_cli(physics, "Stability, speed and turnability of a robot's physics.")
+    run_cli(physics, "Stability, speed and equivalence modulo orientation of a robot's physics.")

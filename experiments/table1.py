@@ -1,4 +1,4 @@
-"""Table 1, all of it: `python -m experiments.table1 --robot ant`."""
+"""All of Table 1 for one robot: `python -m experiments.table1 --robot ant`."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ Methods = Sequence[GoalConditioned | InverseDynamics]
 
 @dataclasses.dataclass(frozen=True)
 class Table(Options):
-    """What the whole table takes.
+    """Settings of the whole table.
 
     Attributes:
       robot: ant, humanoid, humanoid_world or minitaur.
-      methods: the rows to make; what lies under `run_dir` already stands in the table, too.
-      include_hf: also the rows that the paper does not have (HF); off, they are left out.
-      seeds: how many training seeds, from `seed` on. The first makes the rows; the spread
-        over all of them stands beside.
-      episodes_per_extra_seed: test episodes a test seed with the later training seeds.
+      methods: the methods to run; the table also shows finished runs of other methods under
+        `run_dir`.
+      include_hf: whether to run HF, which the paper does not have.
+      seeds: number of training seeds, from `seed`. The first makes the rows; the column "over
+        seeds" shows the spread over all.
+      episodes_per_extra_seed: test episodes per test seed, for all training seeds but the first.
     """
 
     robot: str = "ant"
@@ -52,33 +53,33 @@ class Table(Options):
 
 
 def chosen(options: Table) -> list[GoalConditioned | InverseDynamics]:
-    """The methods that a user named.
+    """The methods to run, without duplicates.
 
     Raises:
-      BadInput: there is no such method, or none is left.
+      BadInput: a method is unknown, or none is left.
     """
     rows = [by_name(name, options.robot) for name in dict.fromkeys(options.methods)]
     rows = rows if options.include_hf else [row for row in rows if row.name not in EXTRA]
     if not rows:
-        raise BadInput(f"no method to run; there are: {', '.join(ORDER)}")
+        raise BadInput(f"no method to run; choose from {', '.join(ORDER)}")
     return rows
 
 
 def grouped(methods: Methods) -> list[GoalConditioned | InverseDynamics]:
-    """Methods that learn from one agent's experience together: it is collected by the first."""
+    """Sorts methods so that those with the same experience follow each other."""
     sources = [(method.agent, method.task) for method in methods]
     return sorted(methods, key=lambda method: sources.index((method.agent, method.task)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """A cell to run, and what it is tested on.
+    """A run and its test scenarios.
 
     Attributes:
-      run: what is run.
+      run: the run.
       scenarios: the scenarios of its test.
-      whole: those of the table's rows. Where the cell has been tested on them already, that
-        test stands, so that a table does not depend on which command came first.
+      whole: the scenarios of the table's rows. If the run is already tested on them, that test is
+        used, so that the table does not depend on the order of commands.
     """
 
     run: Run[Any]
@@ -86,7 +87,7 @@ class Work:
     whole: Scenarios
 
     def execute(self) -> Stage:
-        """The finished test."""
+        """Runs whatever is not finished, up to the test; returns the stage of the test."""
         done = self.run.test_stage(self.whole).done
         return self.run.run_test(self.whole if done else self.scenarios)
 
@@ -95,7 +96,7 @@ class Work:
 
 
 def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
-    """The cells of the table, seed by seed; the later ones on the first of the scenarios."""
+    """The runs of the table, seed by seed; later seeds use only the first scenarios."""
     numbers = range(options.seed, options.seed + options.seeds)
     seeds = [dataclasses.replace(options, seed=seed) for seed in numbers]
     first, *later = ([make_run(robot, m, these) for m in grouped(methods)] for these in seeds)
@@ -112,21 +113,21 @@ def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
 
 
 def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, list[Exception]]:
-    """Runs every cell that is not done, then writes one table of all.
+    """Runs every cell that is not finished, then writes one table of all.
 
-    A cell that fails does not keep the others from running.
+    If a cell fails, the others still run.
 
     Args:
-      robot: whose table it is.
-      methods: its rows, in any order.
-      options: scale, seeds, places.
+      robot: the robot.
+      methods: the methods, in any order.
+      options: settings of the table.
 
     Returns:
-      the directory of the report, or None where no cell on the table's own scenarios ended;
-      and what the cells that did not end failed with.
+      the directory of the report, or None if every cell on the table's own scenarios failed; and
+      the errors of the cells that failed.
 
     Raises:
-      BadInput: an option cannot be; nothing has been run then.
+      BadInput: an option is invalid; then nothing has run.
     """
     todo = work(robot, methods, options)
     announce(robot, options.engine)
@@ -147,26 +148,26 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
 
 
 def attempt(item: Work) -> Stage | Exception:
-    """Runs a cell to its end; or what it failed with, once that is said on stderr."""
+    """Runs a cell; returns its finished test, or its error after printing it to stderr."""
     try:
         return item.execute()
     except BadInput as error:
         print(f"error: {item}: {error}", file=sys.stderr)
         return error
-    except Exception as error:  # of whatever kind: the other cells do not depend on it
+    except Exception as error:  # any error: the other cells do not depend on this one
         traceback.print_exc()
         print(f"error: {item} failed", file=sys.stderr)
         return error
 
 
 def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
-    """Runs the cells and prints the table; a cell that failed shows in the exit status."""
+    """Runs the cells and prints the table; the exit status is not 0 if a cell failed."""
     robot = robot_by_name(options.robot, options.engine)
     report, failures = run(robot, chosen(options), options)
     if report:
         print((report / "table.txt").read_text(encoding="utf-8"))
     if failures:
-        print(f"error: {len(failures)} cells did not end; see above", file=sys.stderr)
+        print(f"error: cells that failed: {len(failures)}; see above", file=sys.stderr)
         sys.exit(2 if all(isinstance(error, BadInput) for error in failures) else 1)
 
 

@@ -1,8 +1,7 @@
 """One method on one robot, end to end: `python -m experiments.train --robot ant --method LR`.
 
-The named cells (`python -m experiments.ant_lr`) do the same; this runs every robot of
-`genidm.robots.ROBOTS` with every method of its table, also those that have no file of their own.
-All other flags are those of a named cell.
+`python -m experiments.ant_lr` does the same for one cell of Table 1. This command runs every robot
+of `genidm.robots.ROBOTS` with every method, and takes the same flags.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ USAGE = "usage: python -m experiments.train --robot ROBOT --method METHOD [flags
 
 
 def named(arguments: Sequence[str]) -> tuple[str | None, str | None, list[str]]:
-    """What `--robot` and `--method` name, and the flags that are left.
+    """Parses `--robot` and `--method`; returns both and the other arguments.
 
     Raises:
-      BadInput: one of them is without a name.
+      BadInput: a value is missing.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--robot")
@@ -35,23 +34,23 @@ def named(arguments: Sequence[str]) -> tuple[str | None, str | None, list[str]]:
     return found.robot, found.method, rest
 
 
-def there_are(robot: str | None) -> str:
-    """The robots, and the methods of one of them."""
+def choices(robot: str | None) -> str:
+    """Text that lists all robots, and the methods of `robot`."""
     of = methods.TABLES.get(robot or "", methods.ANT)
     return f"robots: {', '.join(ROBOTS)}; methods: {', '.join(method.name for method in of)}"
 
 
 def main() -> None:
-    """Takes `--robot` and `--method` off the command line; the cell reads the rest."""
+    """Runs the cell that `--robot` and `--method` name, with the other arguments."""
     with command.in_sentences():
         robot, method, rest = named(sys.argv[1:])
         if robot is None or method is None:
             if {"-h", "--help"} & set(rest):
-                print(f"{USAGE}\n\n{there_are(robot)}\n\nBoth named, --help lists the flags.")
+                print(f"{USAGE}\n\n{choices(robot)}\n\nWith both, --help lists all flags.")
                 return
-            raise BadInput(f"give --robot and --method; {there_are(robot)}")
+            raise BadInput(f"give --robot and --method; {choices(robot)}")
         if robot not in ROBOTS:
-            raise BadInput(f"no robot is called {robot!r}; {there_are(None)}")
+            raise BadInput(f"no robot is called {robot!r}; {choices(None)}")
         chosen = methods.by_name(method, robot)
     sys.argv[1:] = rest
     command.main(ROBOTS[robot], chosen)

@@ -1,4 +1,4 @@
-"""How fast the agents walk that collected: `python -m experiments.walk runs/ant`."""
+"""Walking speed of the agents that collected experience: `python -m experiments.walk runs/ant`."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ def main(
     episodes: int = 100,
     engine: str | None = None,
 ) -> None:
-    """Forward speed of the last policy of every agent that collected under `root`.
+    """Prints the forward speed of the last policy of every agent that collected under `root`.
 
     Args:
-      root: the directory of a robot's stages.
-      episodes: episodes of 1000 steps, or up to a fall.
-      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
+      root: the directory of a robot's runs, such as runs/ant.
+      episodes: number of episodes; each ends after 1000 steps or a fall.
+      engine: "mjx" or "mujoco"; default: MJX on an accelerator, MuJoCo in C on a CPU.
 
     Raises:
-      BadInput: there is none, or no episode.
+      BadInput: `root` has no such agent, or `episodes` is out of range.
     """
     check_value("episodes", episodes, count(1, MOST_EPISODES))
     policies = sorted(Path(root).glob("experience-*/policy"))
     if not policies:
-        raise BadInput(f"no agent has collected under {root}: it is to be as runs/ant is")
+        raise BadInput(f"no agent has collected under {root}; give a directory such as runs/ant")
     for path in policies:
         policy = controller.load(path, engine=engine)
         speed = walking_speed(policy.robot, policy, episodes)
         name = path.parent.name
-        print(f"{name}: {speed.mean():.2f} m/s, {speed.std():.2f} between episodes")
+        print(f"{name}: {speed.mean():.2f} ± {speed.std():.2f} m/s over episodes")
 
 
 if __name__ == "__main__":
-    run_cli(main, "How fast the agents walk that collected.")
+    run_cli(main, "Walking speed of the agents that collected experience.")

@@ -1,4 +1,4 @@
-"""Fig. 7: `python -m experiments.waypoints runs/ant/LR-0-… runs/ant/VGCP-0-…`."""
+"""Fig. 7, waypoints: `python -m experiments.waypoints runs/ant/LR-0-… runs/ant/VGCP-0-…`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from genidm.report.rows import jsonable
 from genidm.runs.cell import saved
 from genidm.runs.command import run_cli
 
-# Metres. It goes ahead, turns both ways, and comes back facing where it started from.
+# Metres. The path goes ahead, turns left by more than 180°, and ends 2.8 m from its start.
 LOOP = (3.0, 0.0, 5.0, 2.0, 4.0, 5.0, 0.0, 5.0, -2.0, 2.0)
 
 
@@ -33,21 +33,20 @@ def main(
     out: Path = Path("runs/waypoints"),
     settings: Annotated[WaypointSettings, tyro.conf.arg(name="")] = WaypointSettings(),
 ) -> None:
-    """Leads robots through waypoints, one controller after another from the same starts.
+    """Runs controllers through waypoints, all from the same initial states.
 
     Args:
-      runs: directories of fits or baselines (METHOD-SEED-…), as cells leave them under --run-dir.
-      waypoints: x and y of each, metres; starts are near the origin.
-      robots: journeys of each controller.
-      yaw: radians, that the starts are turned by.
-      seed: of the starts.
-      engine: "mjx" or "mujoco"; MJX on an accelerator, MuJoCo in C on a CPU, unless given.
-      out: directory that gets the figure and the numbers.
-      settings: of a journey.
+      runs: directories of fits or baselines (METHOD-SEED-…) under --run-dir.
+      waypoints: x and y of each, metres; robots start near the origin.
+      robots: robots per controller.
+      yaw: radians by which the initial states are rotated.
+      seed: of the initial states.
+      engine: "mjx" or "mujoco"; default: MJX on an accelerator, MuJoCo in C on a CPU.
+      out: directory for the figure and the numbers.
+      settings: length of an episode, goal radius.
 
     Raises:
-      BadInput: runs of different robots, or none; waypoints that are none; `out` cannot be
-        written.
+      BadInput: no runs, or runs of different robots; invalid waypoints; or `out` is not writable.
     """
     check_value("robots", robots, count(1, 10_000))
     check_value("yaw", yaw, number())
@@ -74,18 +73,18 @@ def main(
 
 
 def sentence(made: WaypointRuns) -> str:
-    """What became of the journeys, in words."""
+    """A summary of one controller's runs in one sentence."""
     found = made.summary()
-    whole = made.times[np.isfinite(made.times).all(1), -1]
-    took = f", in {whole.mean():.1f} s" if len(whole) else ""
+    complete = made.times[np.isfinite(made.times).all(1), -1]
+    duration = f", in {complete.mean():.1f} s" if len(complete) else ""
     each = " ".join(str(n) for n in (made.arrival >= 0).sum(0))
     return (
-        f"{len(whole)} of {found['runs']} through all waypoints{took} ({each} reached each); "
-        f"{found['cross_track_error']:.2f} m from the path, "
-        f"body {np.degrees(found['heading_error'] or 0):.0f}° from its course, "
+        f"{len(complete)} of {found['runs']} reached all waypoints{duration} (each: {each}); "
+        f"cross-track error {found['cross_track_error']:.2f} m, "
+        f"heading error {np.degrees(found['heading_error'] or 0):.0f}°, "
         f"{found['fell']:.0%} fell"
     )
 
 
 if __name__ == "__main__":
-    run_cli(main, "Through waypoints.")
+    run_cli(main, "Runs controllers through waypoints.")

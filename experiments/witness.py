@@ -1,10 +1,10 @@
-"""A witness for HER_SP: Stable-Baselines3's HER and SAC on gymnasium's Ant-v5.
+"""An independent check of HER_SP: Stable-Baselines3's HER and SAC on gymnasium's Ant-v5.
 
     pip install torch stable-baselines3 "gymnasium[mujoco]"
     python -m experiments.witness
 
-Only the task is ours: starts, goals, reward, settings and budget are those of HER_SP, the
-simulator and the learner are others'. If HER_SP is far from it, HER_SP is wrong. It runs on
+Initial states, goals, reward, settings and interactions are those of HER_SP; the simulator and the
+learner are not ours. A large difference in the results means that our HER_SP is wrong. It runs on
 one core, for more than an hour at the paper's scale.
 """
 
@@ -33,8 +33,8 @@ try:
     import torch
     from gymnasium.spaces import Box, Dict
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-except ImportError as error:  # an extra, and nothing else here works without it
-    sys.exit(f'error: the witness needs {error.name}: pip install -e ".[benchmark]"')
+except ImportError as error:
+    sys.exit(f'error: this experiment needs {error.name}: pip install -e ".[benchmark]"')
 
 Seen = dict[str, np.ndarray]
 
@@ -44,13 +44,13 @@ DISCOUNTING = AGENT.discounting
 
 
 class GoalAnt(gymnasium.Wrapper):
-    """gymnasium's Ant-v5 on HER_SP's task, as a goal environment for HER.
+    """gymnasium's Ant-v5 with HER_SP's task, as a goal environment for HER.
 
-    Observations are dicts: the Ant's own numbers, its position and its goal `[2]`, metres.
+    Observations are dicts: the Ant's observation, its position and its goal, each `[2]`, metres.
 
     Args:
-      task: yaw and bearing of starts and goals, and the goal radius.
-      steps: the time limit.
+      task: ranges of the initial yaw and of the goal's bearing, and the goal radius.
+      steps: time limit of an episode.
     """
 
     def __init__(self, task: GoToGoal, steps: int):
@@ -82,10 +82,10 @@ class GoalAnt(gymnasium.Wrapper):
         return seen, reward, fallen or reward == 0.0, late, info
 
     def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, infos: Any) -> np.ndarray:
-        """0 within the goal radius, −1 otherwise (A.1.1), `[...]`; HER asks for it again.
+        """Reward `[...]`: 0 within the goal radius, −1 otherwise (A.1.1); HER recomputes it.
 
-        A fall ends the episode, and is charged −1 for ever: with less to pay it would be best
-        to fall at once.
+        A fall ends the episode, and its reward is that of −1 in all later steps. Otherwise the
+        best policy would be to fall at once.
         """
         fallen = np.array([info["fallen"] for info in np.atleast_1d(infos)])
         far = np.linalg.norm(achieved - desired, axis=-1)
@@ -98,12 +98,12 @@ class GoalAnt(gymnasium.Wrapper):
 
 
 def rotation(yaw: float) -> np.ndarray:
-    """By `yaw` about z, of the plane `[2, 2]`."""
+    """Rotation matrix `[2, 2]` of the horizontal plane by `yaw`."""
     return np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
 
 
 def turned(quaternion: np.ndarray, yaw: float) -> np.ndarray:
-    """(w, x, y, z) after a turn by `yaw` about the world's z."""
+    """Rotates a quaternion (w, x, y, z) by `yaw` about the world's z axis."""
     w, x, y, z = quaternion
     c, s = math.cos(yaw / 2), math.sin(yaw / 2)
     return np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
@@ -116,7 +116,7 @@ def heading(quaternion: np.ndarray) -> float:
 
 
 class Relative(BaseFeaturesExtractor):
-    """(s, g − o), as every baseline of the paper is fed."""
+    """Features (s, g − o), the input of every baseline in the paper."""
 
     def __init__(self, space: Any):
         super().__init__(space, space["observation"].shape[0] + 2)
@@ -127,7 +127,7 @@ class Relative(BaseFeaturesExtractor):
 
 
 def learner(env: GoalAnt, seed: int) -> Any:
-    """SAC with HER, at HER_SP's settings where it has such; the rest as its authors left it."""
+    """SAC with HER: HER_SP's settings, else the defaults of Stable-Baselines3."""
     ours = HER_SP.agent
     assert isinstance(ours, SAC) and ours.her
     return sb3.SAC(
@@ -160,10 +160,10 @@ def learner(env: GoalAnt, seed: int) -> Any:
 
 
 def closest(env: GoalAnt, act: Callable[[Seen], np.ndarray], episodes: int) -> np.ndarray:
-    """Closest distance to the goal, metres, of each of some test episodes."""
+    """Closest distance to the goal in test episodes, metres `[episodes]`."""
     found = []
     for episode in range(episodes):
-        seen, _ = env.reset(seed=1_000_000 + episode)  # the same for whoever is tested
+        seen, _ = env.reset(seed=1_000_000 + episode)  # the same episodes for all policies
         distances, over = [], False
         while not over:
             seen, _, fallen, late, _ = env.step(act(seen))
@@ -174,7 +174,7 @@ def closest(env: GoalAnt, act: Callable[[Seen], np.ndarray], episodes: int) -> n
 
 
 def summary(distances: np.ndarray) -> dict[str, float]:
-    """Mean and deviation of closest distances, and the share within a metre."""
+    """Mean and standard deviation of closest distances, and the share within one metre."""
     return {
         "mean": float(distances.mean()),
         "std": float(distances.std()),
@@ -190,14 +190,14 @@ def main(
     parts: int = 8,
     seed: int = 0,
 ) -> None:
-    """Lets it learn, tests it as it goes, and tests random actions beside it.
+    """Trains HER with SAC, tests it several times, and tests random actions for comparison.
 
     Args:
-      out: the file that gets the numbers.
-      interactions: steps that it learns from.
-      episodes: test episodes (A.1.3: of up to 1000 steps).
-      parts: tests, over its learning.
-      seed: of its learning.
+      out: JSON file for the results.
+      interactions: environment steps of the training.
+      episodes: episodes per test (A.1.3: at most 1000 steps each).
+      parts: number of tests during the training.
+      seed: of the training.
     """
     task = HER_SP.task
     assert isinstance(task, GoToGoal)

@@ -1,7 +1,7 @@
-"""Imports MJX without its word on a backend that genidm does not use.
+"""Imports MJX without its messages about a backend that genidm does not use.
 
-MJX 3.17 prints two lines on stdout wherever `warp` is not installed; anything else that it
-may have to say is kept, on stderr.
+MJX 3.17 prints two lines on stdout where `warp` is not installed. These are dropped; anything
+else that the import prints goes to stderr.
 """
 
 import contextlib
@@ -11,14 +11,14 @@ from types import ModuleType
 
 
 def _import_mjx() -> ModuleType:
-    """Imports `mujoco.mjx`; the first import in a process is the one that prints."""
-    said = io.StringIO()
+    """Imports `mujoco.mjx`; only the first import in a process prints."""
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said):
+        with contextlib.redirect_stdout(printed):
             from mujoco import mjx
         return mjx
     finally:
-        for line in said.getvalue().splitlines():
+        for line in printed.getvalue().splitlines():
             if not line.endswith("No module named 'warp'"):
                 print(line, file=sys.stderr)
 

@@ -57,7 +57,7 @@ def one_bank(monkeypatch) -> None:
     monkeypatch.setattr(
         cell_module,
         "scenarios",
-        lambda robot, *numbers: small_cells.scenarios(robot.name, *numbers),
+        lambda robot, *numbers: small_cells.tested_scenarios(robot.name, *numbers),
     )
 
 

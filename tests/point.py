@@ -64,7 +64,7 @@ class Point(Robot):
         self.settings = dict(
             name=self.name,
             speed=speed,
-            input_frame=frame,
+            frame=frame,
             falls_at=falls_at,
             diverges_at=diverges_at,
         )

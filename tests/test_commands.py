@@ -183,7 +183,7 @@ def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, m
     one, again = written["methods"].values()
     assert one == again and one["runs"] == 2 and len(one["reached"]) == 5
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
-    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 through all waypoints")
+    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 reached all waypoints")
     for wrong, robots, why in (((), 1, "of a run"), (runs, 0, "robots must")):
         with pytest.raises(BadInput, match=why):
             waypoints.main(wrong, robots=robots, out=tmp_path)
@@ -309,11 +309,11 @@ def test_the_experience_of_another_robot_is_refused(copy: Path, capsys) -> None:
     tree, meta = load_arrays(chunk)
     wheels = {**tree, "physics": {"wheels": tree["s"]}}
     save_arrays(chunk, wheels, meta, overwrite=True)
-    refused(copy, capsys, "physics of another robot than point")
+    refused(copy, capsys, "physics of another robot, not point")
     save_arrays(chunk, {**tree, "s": tree["s"][..., 1:]}, meta, overwrite=True)
     refused(copy, capsys, "s has shape")
     save_arrays(chunk, {"x": tree["s"]}, meta, overwrite=True)
-    refused(copy, capsys, "holds no experience")
+    refused(copy, capsys, "does not hold an experience")
 
 
 def test_a_checkpoint_of_another_setting_is_refused(copy: Path, capsys) -> None:

@@ -446,7 +446,7 @@ def env() -> Iterator[Any]:
 def test_an_action_that_is_none_is_refused_and_changes_nothing(env: Any, action: Any) -> None:
     env.reset()
     before = env.simulation.read()
-    with pytest.raises(BadInput, match="an action is 8 finite numbers"):
+    with pytest.raises(BadInput, match="an action must be 8 finite numbers"):
         env.step(action)
     same(env.simulation.read(), before)
     s, reward, fallen, _, _ = env.step(np.zeros(8))

@@ -85,7 +85,7 @@ def test_workers_that_are_killed_meanwhile_take_nothing_with_them(
         advance(self, *args, **kwargs)
 
     monkeypatch.setattr(Progress, "advance", shoot)
-    with pytest.warns(RuntimeWarning, match="another takes its place"):
+    with pytest.warns(RuntimeWarning, match="another one replaces it"):
         record = gathered(robot)
     assert shot and robot.engine.pool.replaced >= 3
     same(record, undisturbed)

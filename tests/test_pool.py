@@ -71,7 +71,7 @@ def test_a_row_that_costs_its_worker_is_the_only_one_lost(
     pool, x = make(patience=patience), rows(40)
     pool.map(x)
     x[17, 0] = number
-    with pytest.warns(RuntimeWarning, match="another takes its place"):
+    with pytest.warns(RuntimeWarning, match="another one replaces it"):
         answers = pool.map(x)[:, 0]
     assert np.flatnonzero(np.isnan(answers)).tolist() == [17]
     assert np.array_equal(np.delete(answers, 17), np.delete(x.sum(1), 17))
@@ -87,7 +87,7 @@ def test_a_worker_that_is_shot_takes_nothing_with_it(
     pool.map(x)
     for pid in idle(pool):
         os.kill(pid, blow)
-    with pytest.warns(RuntimeWarning, match="to be lost"):
+    with pytest.warns(RuntimeWarning, match="died or hung"):
         answers = pool.map(x)
     assert np.array_equal(answers, x.sum(1, keepdims=True))
     assert 1 <= pool.replaced <= 2
@@ -95,7 +95,7 @@ def test_a_worker_that_is_shot_takes_nothing_with_it(
 
 def test_a_worker_that_never_starts_is_an_error(make: Callable[..., Pool]) -> None:
     pool = make("stillborn")
-    said = rf"before it said anything, {TRIES} times: .*stand_in\.py stillborn"
+    said = rf"failed to start, {TRIES} times: .*stand_in\.py stillborn"
     for ask in (pool.greeting, lambda: pool.map(rows(40)), pool.greeting):
         with pytest.raises(BadInput, match=said):  # nobody waits for it, either
             ask()
@@ -121,7 +121,7 @@ def test_a_worker_that_dies_later_is_replaced_by_one_that_starts_late(
     pool.command = [*pool.command[:-1], "2"]
     for pid in idle(pool):
         os.kill(pid, signal.SIGKILL)
-    with pytest.warns(RuntimeWarning, match="another takes its place"):
+    with pytest.warns(RuntimeWarning, match="another one replaces it"):
         assert np.array_equal(pool.map(x), x.sum(1, keepdims=True))
     assert len(starts.read_text()) == 3
 

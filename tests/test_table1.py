@@ -50,7 +50,7 @@ def options(out: Path, **changes) -> Table:
         episodes_per_extra_seed=1,
         test=TEST,
     )
-    return dataclasses.replace(this, **{"results": out / "results", **changes})
+    return dataclasses.replace(this, **{"report_dir": out / "results", **changes})
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -360,4 +360,4 @@ def test_the_exit_status_tells_of_failures(
     assert (robot.name, [row.name for row in rows], given.seed) == ("point", ["LR", "RS"], 4)
     out = capsys.readouterr()
     assert out.out == "the table\n"
-    assert (f"{len(errors)} cells did not end" in out.err) == bool(errors)
+    assert (f"cells that failed: {len(errors)};" in out.err) == bool(errors)

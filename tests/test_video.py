@@ -166,7 +166,7 @@ def test_a_robot_is_made_again_from_its_settings(robot, tmp_path: Path) -> None:
 def test_settings_of_no_robot_are_refused() -> None:
     settings = json.loads(json.dumps(to_json(Ant().settings)))
     for wrong in ({"legs": 6}, {"solver": {**settings["solver"], "bends": 1}}):
-        with pytest.raises(BadInput, match="makes no ant"):
+        with pytest.raises(BadInput, match="cannot make the ant"):
             remade(settings | wrong)
 
 
@@ -254,7 +254,7 @@ def test_a_page_says_how_the_journeys_went(made: Video) -> None:
     page = contents(made)
     for shown, take in zip(page["takes"], made.clips, strict=True):
         assert shown["arrivals"] == [pytest.approx(take.seconds)]
-        assert shown["outcome"] == f"there in {take.seconds:.1f} s"
+        assert shown["outcome"] == f"arrived after {take.seconds:.1f} s"
         np.testing.assert_allclose(
             np.array(shown["frames"])[-1, :3] / 1e3, take.position[-1], atol=6e-4
         )
@@ -425,8 +425,8 @@ def test_what_does_not_start_is_not_taken() -> None:
 
 
 REFUSED: list[tuple[str, dict, str]] = [
-    ("film.avi", {}, r"a \.gif, an \.mp4 or a page"),
-    ("render", {}, r"a \.gif, an \.mp4 or a page"),
+    ("film.avi", {}, r"a video must be a"),
+    ("render", {}, r"a video must be a"),
     ("a.gif", {"fps": math.nan}, "fps must be a finite number"),
     ("a.gif", {"fps": 60.0}, r"fps of a gif must lie in .*50"),
     ("a.mp4", {"fps": 1e-9}, "fps must lie in"),
@@ -434,7 +434,7 @@ REFUSED: list[tuple[str, dict, str]] = [
     ("a.mp4", {"width": 10**6}, "width must be at most 8192"),
     ("a.gif", {"height": -3}, "height must be at least 16"),
     ("file/a.gif", {}, "cannot use .*file/a.gif"),
-    ("folder.html", {}, "folder.html: Is a directory"),
+    ("folder.html", {}, "a directory, not a file"),
     (f"{'x' * 300}.mp4", {}, "File name too long"),
     ("proc/a.html", {}, "cannot use"),
 ]
@@ -463,7 +463,7 @@ def test_what_cannot_be_written_is_refused_before_there_is_a_film(
 
 def test_checking_leaves_no_file(tmp_path: Path) -> None:
     shot = video.check(str(tmp_path / "new" / "a.html"), width=99)  # and a str is a path
-    assert shot.width == 99 and [p.name for p in tmp_path.rglob("*")] == ["new"]
+    assert shot.width == 99 and not [*tmp_path.rglob("*")]
 
 
 def test_a_command_refuses_in_one_sentence(
@@ -502,12 +502,14 @@ def test_a_cell_films_its_controller_even_where_no_picture_can_be_drawn(
     for other in ("test-of-others", "no run", *(p.name for p in tmp_path.glob("point/exp*"))):
         with pytest.raises(BadInput, match=r"done\.json|controller"):
             video.render_run(tmp_path / "point" / other, robot=Drawn())
-    assert beside["title"] == "RS, point" and "no gif: no picture" in capsys.readouterr().err
+    assert (
+        beside["title"] == "RS, point" and "no gif: MuJoCo cannot render" in capsys.readouterr().err
+    )
     monkeypatch.setitem(robots.ROBOTS, "point", Drawn)
     main((path.parent,), (tmp_path / "again.html",), seconds=LONGEST)
     assert inside((tmp_path / "again.html").read_text()) == beside  # found by its run alone
     main((path.parent,), (tmp_path / "way.html",), (4, 1), waypoints=(9.0, 0.0, 0.0, 9.0))
-    with pytest.raises(BadInput, match="of one run"):
+    with pytest.raises(BadInput, match="exactly one run"):
         main((path.parent,) * 2)
     way = inside((tmp_path / "way.html").read_text())
     assert [take["waypoints"] for take in way["takes"]] == [[[9, 0, 0.5], [0, 9, 0.5]]] * 2
@@ -528,7 +530,7 @@ def test_a_test_is_read_by_the_film_alone_which_sees_whether_it_is_corrupt(tmp_p
     assert recorded(run, Drawn(), [0, 1]) is None
     (take,) = video.render_recorded(Drawn(), str(test)).clips
     assert take.arrival.tolist() == [2] and not take.fell
-    with pytest.raises(BadInput, match="no recording of episode 0"):
+    with pytest.raises(BadInput, match="has not recorded episode 0"):
         video.render_recorded(Drawn(), test, [1, 0])
     (test / "episodes" / "recordings.1.qpos.npy").write_bytes(b"corrupt")
     assert recorded(run, Drawn()) == test
@@ -539,7 +541,7 @@ def test_a_test_is_read_by_the_film_alone_which_sees_whether_it_is_corrupt(tmp_p
 def test_a_test_that_has_recorded_nothing_is_no_film(tmp_path: Path) -> None:
     save_arrays(tmp_path / "episodes", {"episodes": {"fell": np.zeros((1, 1), bool)}}, {})
     Stage(tmp_path).finish({"test": to_json(EvaluationSettings())})
-    with pytest.raises(BadInput, match="no recording"):
+    with pytest.raises(BadInput, match="has not recorded"):
         video.render_recorded(Drawn(), tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""How physics is stepped: one file an engine, behind one contract (`genidm.engines.base`)."""
+"""Physics engines, one file each, behind one contract (`genidm.engines.base`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from genidm.engines.mjx import MJX
 from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
 
-# Engines of MuJoCo models.
+# Engines that step MuJoCo models, by name. `choose` prefers earlier entries.
 ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (MJX, MuJoCo)}
 
 
@@ -21,35 +21,34 @@ E = TypeVar("E", bound=type[Engine])
 
 
 def register(kind: E) -> E:
-    """Makes an engine known by its name: to every robot with a MuJoCo model, and to `--engine`.
+    """Registers an engine by its name, for every robot with a MuJoCo model and for `--engine`.
 
-    It is a class decorator, for engines outside of genidm; genidm's own stand in `ENGINES`.
-    Without `--engine` an engine that stands further up is chosen.
+    A class decorator for engines outside genidm; genidm's own engines are listed in `ENGINES`.
 
     Args:
-      kind: the class, which is made as `kind(spec, frame_skip)`. It may be registered again.
+      kind: the class, called as `kind(spec, frame_skip)`. It may be registered again.
 
     Returns:
       the class.
 
     Raises:
-      BadInput: a method of the contract is missing, or another engine has this name.
+      BadInput: a method or constant of the contract is missing, or another engine has this name.
     """
     registry.add(ENGINES, kind, "engine")
     return kind
 
 
 def choose(name: str | None, offered: Collection[str], robot: str) -> str:
-    """The engine to step a robot with.
+    """Chooses the name of the engine that steps a robot.
 
     Args:
-      name: what the user asks for; None chooses one for an accelerator where jax has one, else
-        one for a CPU (`Engine.on_accelerator`).
-      offered: the engines that can step the robot.
-      robot: its name.
+      name: the user's choice. None chooses by hardware: an engine for accelerators if jax has an
+        accelerator, else one for CPUs (`Engine.on_accelerator`).
+      offered: names of the engines that can step the robot.
+      robot: the robot's name, for the message.
 
     Raises:
-      BadInput: the robot is not stepped by that engine.
+      BadInput: `name` is not in `offered`.
     """
     if name is None:
         on = devices.accelerated()
@@ -61,12 +60,12 @@ def choose(name: str | None, offered: Collection[str], robot: str) -> str:
 
 
 def of_model(name: str, spec: mujoco.MjSpec, frame_skip: int) -> Engine:
-    """The engine of that name for a MuJoCo model.
+    """Makes the engine of this name for a MuJoCo model.
 
     Args:
       name: one of `ENGINES`.
       spec: the model.
-      frame_skip: physics steps a control step.
+      frame_skip: physics steps per control step.
     """
     kind: Any = ENGINES[name]  # a subclass, which takes arguments
     return kind(spec, frame_skip)

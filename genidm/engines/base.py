@@ -1,25 +1,22 @@
-"""The Engine contract: how physics is stepped, for a robot that says what it is.
+"""The Engine contract: an engine steps the physics of a batch of robots.
 
-An engine is pure as seen from jax: physics rows and actions in, rows and readings out, and
-nothing is kept between two steps. So any state can be set, lanes can be refilled, records can
-be replayed (𝒢), and a run that was killed goes on with the same bits.
+For jax an engine is a pure function: physics and actions in, physics and readings out. It keeps
+nothing between two steps. So any state can be set, lanes can be refilled, records can be
+replayed (𝒢), and a killed run resumes with the same bits.
 
-To add an engine (MuJoCo Warp, say), write one file with a subclass of `Engine`, and name it in
-`genidm.engines.ENGINES`; docs/extending.md shows one. It has to do five things:
+To add an engine (MuJoCo Warp, for example), write one file with a subclass of `Engine` and add it
+to `genidm.engines.ENGINES`, or register it; docs/extending.md shows one. An engine has five duties:
 
-1. `__init__(spec, frame_skip)`: take a MuJoCo model and the number of physics steps in a control
-   step. `Physics` is what it is given and gives back.
-2. `step(physics, action)`: make one control step of every lane. It is called inside jitted
-   programs, so it is either made of jax operations or a `jax.pure_callback`. A lane whose
-   physics leaves the finite numbers, or that the engine resets by itself, comes back as NaN;
-   the other lanes are not touched by it.
-3. Say the moment of its readings: contact wrenches belong to the start of the last physics
-   step, as in `mj_step`.
-4. Say how long 𝒢's segments may be (`segment`), measured as `experiments.physics` does.
-5. Say where it runs best: `on_accelerator`, and `one_device` if it has threads or processes of
-   its own.
+1. `__init__(spec, frame_skip)` takes a MuJoCo model and the number of physics steps per control
+   step. `step` takes and returns `Physics`.
+2. `step(physics, action)` makes one control step in every lane. Jitted programs call it, so it
+   uses jax operations or `jax.pure_callback`. It returns NaN in a lane whose physics is no longer
+   finite, or that the engine has reset by itself; the other lanes are not affected.
+3. Its readings are those of `mj_step`: contact wrenches at the start of the last physics step.
+4. `segment` is the length of 𝒢's segments, measured as `experiments.physics` does.
+5. `on_accelerator` and `one_device` say where it runs best.
 
-`tests/test_engines.py` holds every engine in `ENGINES` against MuJoCo in C, number by number.
+`tests/test_engines.py` compares every engine in `ENGINES` with MuJoCo in C, number by number.
 """
 
 from __future__ import annotations
@@ -35,12 +32,12 @@ from genidm import devices
 
 
 class Physics(flax.struct.PyTreeNode):
-    """All of a MuJoCo simulation that its next step depends on.
+    """The part of a MuJoCo simulation's state that its next step depends on.
 
     Attributes:
       qpos: `[B, nq]`; base position (m) and quaternion, then joint angles (rad).
       qvel: `[B, nv]`; base velocity (m/s, rad/s), then joint velocities (rad/s).
-      warmstart: `[B, nv]`; accelerations that the constraint solver starts from.
+      warmstart: `[B, nv]`; accelerations (m/s², rad/s²) at which the constraint solver starts.
     """
 
     qpos: Any
@@ -49,13 +46,13 @@ class Physics(flax.struct.PyTreeNode):
 
 
 class Stepped(NamedTuple):
-    """What an engine makes of one control step.
+    """The result of one control step.
 
     Attributes:
-      physics: tree `[B, ...]`, after the step; NaN in a lane that was lost.
-      readings: what only a step can measure. Engines of MuJoCo models give the contact wrench on
-        every body `[B, nbody, 6]` (torque N·m, force N; world frame, about the centre of mass
-        of the robot), at the start of the last physics step.
+      physics: tree `[B, ...]`, after the step; NaN in a lane whose simulation failed.
+      readings: quantities that only a step can measure. Engines of MuJoCo models return the
+        contact wrench on every body `[B, nbody, 6]` (torque N·m, force N; world frame, about the
+        centre of mass of the robot), at the start of the last physics step.
     """
 
     physics: Any
@@ -66,13 +63,13 @@ class Engine(abc.ABC):
     """Steps a batch of lanes.
 
     Attributes:
-      name: as `--engine` takes it.
-      label: what tables call it, with the precision of its rows.
-      on_accelerator: whether it is the one to choose where jax has an accelerator.
-      segment: control steps that a turned replay stays within millimetres of the record for
-        (docs/physics.md): the segments of 𝒢, unless the user gives their length.
-      one_device: whether all lanes lie on one jax device, because the engine shares them among
-        threads or processes of its own.
+      name: the value of `--engine`.
+      label: name in tables, with the precision of its physics between control steps.
+      on_accelerator: whether it is the default where jax has an accelerator (else: on a CPU).
+      segment: control steps for which a rotated replay stays within millimetres of the record
+        (docs/physics.md); the default length of 𝒢's segments.
+      one_device: whether all lanes are on one jax device, because the engine distributes them
+        over its own threads or processes.
     """
 
     name: ClassVar[str]
@@ -83,14 +80,14 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def step(self, physics: Any, action: jax.Array) -> Stepped:
-        """One control step of physics `[B, ...]` under actions `[B, A]` in [−1, 1]."""
+        """Makes one control step of physics `[B, ...]` under actions `[B, A]` in [−1, 1]."""
 
     @abc.abstractmethod
     def __str__(self) -> str:
-        """What it is and what it runs on, as it is printed at the start of a command."""
+        """The engine and its hardware, as commands print them at their start."""
 
     def mesh(self) -> Mesh:
-        """The devices that share the lanes."""
+        """The jax devices that share the lanes."""
         return devices.mesh(jax.devices()[:1]) if self.one_device else devices.mesh()
 
     def max_parallel_envs(self, lanes: int) -> int:

@@ -1,4 +1,4 @@
-"""PyBullet, in worker processes of this machine: rows through a `Pool`."""
+"""PyBullet in local worker processes; a `Pool` carries the rows."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from genidm.engines.base import Engine, Stepped
 from genidm.engines.pool import Pool
 
-# Robots a process that are stepped at once. The slowest process then takes all of a step's
-# time but for 2 %, with 16 robots 3 %, with 4 12 %; more gain nothing.
+# Robots per process and step. A step then takes 2 % longer than its slowest process; with 16
+# robots 3 %, with 4 robots 12 %. More robots gain nothing.
 KEEP_BUSY = 32
 
 
 class Bullet(Engine):
-    """Physics is rows `[B, width]`, and so is what comes back; there are no other readings.
+    """Steps physics that is rows `[B, width]` of float32; there are no readings.
 
     Args:
       command: the program that a worker runs, and its arguments.
       width: numbers in a row of physics.
-      processes: workers; one for each core that this process may use, unless given.
-      patience: seconds that a worker may take for the rows it is given at once.
+      processes: number of workers; default: one for each core that this process may use.
+      patience: seconds that a worker may take for one request.
 
     Attributes:
       pool: the workers.
@@ -41,7 +41,7 @@ class Bullet(Engine):
         return f"PyBullet in {count} process{'es' if count > 1 else ''}"
 
     def max_parallel_envs(self, lanes: int) -> int:
-        """No more than keep the processes busy: a lane whose episode is over costs a step, too."""
+        """At most what keeps the processes busy: finished lanes cost physics steps, too."""
         return min(lanes, KEEP_BUSY * self.pool.workers)
 
     def step(self, physics: jax.Array, action: jax.Array) -> Stepped:

@@ -1,4 +1,4 @@
-"""MJX: MuJoCo's physics as jax operations, in float32, on whatever device jax has."""
+"""MJX: MuJoCo's physics as jax operations, in float32, on the devices of jax."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from genidm.quiet import mjx
 
 
 class MJX(Engine):
-    """Every jax device steps its own lanes; a program takes 8 to 40 s to compile.
+    """Steps lanes with MJX, each jax device its own lanes; programs compile in 8 to 40 s.
 
     Args:
       spec: the model.
-      frame_skip: physics steps a control step.
+      frame_skip: physics steps per control step.
     """
 
     name = "mjx"
@@ -36,7 +36,7 @@ class MJX(Engine):
         return f"MJX on {count} jax device{'s' if count > 1 else ''} ({kind})"
 
     def max_parallel_envs(self, lanes: int) -> int:
-        """On an accelerator more than was asked for, because small batches leave it idle."""
+        """At least `lanes`; on an accelerator more, because small batches leave it idle."""
         return devices.max_parallel_envs(lanes)
 
     def step(self, physics: Physics, action: jax.Array) -> Stepped:

@@ -1,9 +1,9 @@
 """MuJoCo in C, through `mujoco.batch`: the fastest engine where there is no accelerator.
 
-Jitted programs call it with `jax.pure_callback`. What is rounded, and when: MuJoCo computes in
-float64; the rows that enter and leave a control step are float32, so each control step rounds
-position, velocity and warm start once. docs/physics.md says what that costs 𝒢. Rows of float64,
-under `jax.enable_x64`, stay as they are.
+Jitted programs call it with `jax.pure_callback`. MuJoCo computes in float64; the rows that enter
+and leave a control step are float32, so each control step rounds position, velocity and warm
+start once. docs/physics.md measures the effect on 𝒢. Rows of float64, under `jax.enable_x64`,
+are not rounded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mujoco.batch import Batch, SimulationError
 from genidm.devices import cores
 from genidm.engines.base import Engine, Physics, Stepped
 
-# Warnings of a simulation that is lost: MuJoCo has reset it, or has set its controls to 0.
+# Warnings after which a simulation has failed: MuJoCo has reset it or set its controls to 0.
 _W = mujoco.mjtWarning
 LOST = [
     x.value for x in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_BADCTRL)
@@ -27,13 +27,16 @@ LOST = [
 
 
 class MuJoCo(Engine):
-    """All lanes on one jax device, shared among threads; bits do not depend on their number.
+    """Steps lanes with MuJoCo in C on several threads; their number does not change the bits.
 
     Args:
-      spec: the model. A copy of it is given an accelerometer: MuJoCo computes contact
-        wrenches only for a sensor that needs them.
-      frame_skip: physics steps a control step.
-      threads: that step lanes; one for each core that this process may use, unless given.
+      spec: the model. The engine adds an accelerometer to a copy of it, because MuJoCo computes
+        contact wrenches only for a sensor that needs them.
+      frame_skip: physics steps per control step.
+      threads: number of threads; default: one for each core that this process may use.
+
+    Raises:
+      ValueError: the model has actuators with a state of their own.
     """
 
     name = "mujoco"
@@ -52,11 +55,11 @@ class MuJoCo(Engine):
         if self._model.na or mujoco.mj_stateSize(
             self._model, mujoco.mjtState.mjSTATE_HISTORY.value
         ):
-            raise ValueError("actuators with a state of their own are not part of Physics")
+            raise ValueError("the model has actuators with a state, which Physics does not hold")
         self._frame_skip = frame_skip
         self.threads = threads or cores()
         self._rows: dict[int, _Rows] = {}
-        # A Batch is for one Python thread at a time, and jax may run two programs at once.
+        # Only one Python thread at a time may use a Batch, and jax may run two programs at once.
         self._lock = threading.Lock()
 
     def __str__(self) -> str:
@@ -74,7 +77,7 @@ class MuJoCo(Engine):
         return Stepped(Physics(*parts), wrenches.reshape(len(rows), m.nbody, 6))
 
     def _step_rows(self, rows: jax.Array) -> np.ndarray:
-        # No jax in here: a program that waits for this callback would wait for itself.
+        # No jax operations here: the program that waits for this callback would deadlock.
         given = np.asarray(rows)
         with self._lock:
             if len(given) not in self._rows:
@@ -83,16 +86,17 @@ class MuJoCo(Engine):
 
 
 class _Rows:
-    """A `Batch` of n simulations, as a function of rows.
+    """A `Batch` of n simulations as a function of rows.
 
-    A row is qpos, qvel, warm start and control; an answer qpos, qvel, warm start and wrenches.
+    An input row holds qpos, qvel, warm start and control; an output row holds qpos, qvel, warm
+    start and wrenches.
     """
 
     def __init__(self, model: mujoco.MjModel, count: int, threads: int):
         self._batch = Batch(model, count, nthread=min(threads, count))
         self._wrenches = self._batch.bind("cfrc_ext").reshape(count, -1)
         self._time = self._batch.bind("time")
-        # Neighbours in MuJoCo's own row: time, qpos, qvel, warm start and control.
+        # MuJoCo's own row holds, in this order: time, qpos, qvel, warm start, control.
         self._kept = model.nq + 2 * model.nv
         self._given = self._batch.state[:, 1 : 1 + self._kept + model.nu]
 
@@ -101,15 +105,15 @@ class _Rows:
         self._time[:], self._given[:] = 0.0, rows
         batch.warning[:] = 0
         lost = np.zeros(len(rows), bool)
-        # MuJoCo writes warnings to a file in the working directory, unless somebody hears them.
-        hearer = mujoco.get_mju_user_warning()
+        # Without a handler, MuJoCo writes warnings to a file in the working directory.
+        handler = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(_ignore)
         try:
             batch.step(nstep=frame_skip)
         except SimulationError as error:
             lost[error.ids] = True
         finally:
-            mujoco.set_mju_user_warning(hearer)
+            mujoco.set_mju_user_warning(handler)
         if batch.warning[..., 1].any():
             lost |= batch.warning[:, LOST, 1].any(1)
         answers = np.empty((len(rows), kept + self._wrenches.shape[1]), rows.dtype)
@@ -120,4 +124,4 @@ class _Rows:
 
 
 def _ignore(message: str) -> None:
-    """Lanes that are lost are counted and reported as such."""
+    """Drops a warning: a failed simulation is already reported as a lane of NaN."""

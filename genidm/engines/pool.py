@@ -1,8 +1,8 @@
-"""Rows of numbers through worker processes: each row in, one row out, whoever works on it.
+"""A pool of worker processes that maps rows of numbers to rows of numbers.
 
-A worker holds nothing that a row needs, so that a crash loses nothing: its rows are given to
-another. Workers are plain programs that talk over pipes: they import neither the caller's
-script nor jax, and they end when the pipe does, however this process dies.
+A worker keeps no state between rows, so a crash loses nothing: another worker gets its rows.
+Workers are plain programs that communicate over pipes: they import neither the caller's script
+nor jax, and they end when the pipe closes, however this process dies.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ import numpy as np
 from genidm.devices import cores
 from genidm.errors import BadInput
 
-# Rows given to a worker at once: so few that a worker that is lost takes few with it.
+# Most rows in one request: a small number, because a lost worker costs all rows of its request.
 MOST_ROWS = 16
 # Seconds that a worker may take to load its model.
 START_SECONDS = 120.0
-# Times that a worker is started until it says something; the machine may have been short of memory.
+# Attempts to start a worker: a start may fail because the machine is short of memory.
 TRIES = 3
 
 
 def portions(count: int, workers: int) -> list[int]:
-    """How many rows are given out at once, in turn, until there are none left of `count`.
+    """Splits `count` rows into requests; returns the sizes of the requests, in order.
 
-    Many at first, for each time costs a tenth of a millisecond; in the end one by one, so
-    that no worker waits long for the last.
+    The first are large, because a request costs a tenth of a millisecond; the last hold one row
+    each, so that all workers finish at nearly the same time.
     """
     sizes: list[int] = []
     while left := count - sum(sizes):
@@ -50,18 +50,19 @@ class Lost(Exception):
 class Worker:
     """A process that answers rows of float32.
 
-    Its first answer, `greeting [out]`, comes by itself. A request is an int32 n and n rows.
+    It sends its first answer, `greeting [out]`, without a request. A request is an int32 n and
+    n rows; its answer is n rows.
 
     Args:
       command: the program and its arguments.
       size: numbers in an answered row.
 
     Raises:
-      Lost: it died, or said nothing.
+      Lost: it died or sent no greeting in time.
     """
 
     def __init__(self, command: Sequence[str], size: int):
-        # One thread each: there are as many workers as cores.
+        # One thread per worker, because there is one worker per core.
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(
@@ -77,10 +78,10 @@ class Worker:
             raise
 
     def exchange(self, rows: np.ndarray, patience: float) -> np.ndarray:
-        """Answers `[n, out]` to `rows [n, in]`.
+        """Sends `rows [n, in]` and returns the answers `[n, out]`.
 
         Raises:
-          Lost: there is none within `patience` seconds.
+          Lost: the worker died, or did not answer within `patience` seconds.
         """
         data = np.int32(len(rows)).tobytes() + rows.astype(np.float32).tobytes()
         try:
@@ -113,18 +114,18 @@ class Worker:
 
 
 class Pool:
-    """Workers that share rows among them; they start when they are first needed.
+    """Distributes rows over workers; each worker starts when it is first needed.
 
     Safe to use from several threads at once.
 
     Args:
       command: the program that a worker runs, and its arguments.
       size: numbers in an answered row.
-      workers: how many; one for each core that this process may use, unless given.
+      workers: number of workers; default: one for each core that this process may use.
       patience: seconds that a worker may take for a request.
 
     Attributes:
-      replaced: workers that died or hung, and were replaced.
+      replaced: number of workers that died or hung, and were replaced.
     """
 
     def __init__(
@@ -135,21 +136,21 @@ class Pool:
         self.replaced = 0
         self._counting = threading.Lock()
         self._threads = ThreadPoolExecutor(self.workers, "rows")
-        # None stands for a worker that has not been started.
+        # None stands for a worker that is not running: not started yet, or lost.
         self._idle: queue.LifoQueue[Worker | None] = queue.LifoQueue()
         for _ in range(self.workers):
             self._idle.put(None)
 
     @property
     def processes(self) -> list[int]:
-        """Process ids of the workers that have started and wait for rows."""
+        """Process ids of the workers that run and are idle."""
         return [worker.process.pid for worker in list(self._idle.queue) if worker]
 
     def greeting(self) -> np.ndarray:
-        """What workers say first, `[out]`.
+        """The first answer of a worker, `[out]`; it is the same for all.
 
         Raises:
-          BadInput: none starts.
+          BadInput: no worker starts.
         """
         worker = self._idle.get()
         try:
@@ -159,12 +160,12 @@ class Pool:
             self._idle.put(worker)
 
     def map(self, rows: np.ndarray) -> np.ndarray:
-        """Answers `[n, out]` to `rows [n, in]`, in their order.
+        """Returns the answers `[n, out]` to `rows [n, in]`, in the same order.
 
-        A row that costs a worker its life is answered by NaN; the others are not touched.
+        The answer to a row that kills a worker is NaN; the other rows are not affected.
 
         Raises:
-          BadInput: no worker starts any more.
+          BadInput: no worker starts.
         """
         parts = np.split(rows, np.cumsum(portions(len(rows), self.workers))[:-1])
         return np.concatenate([*self._threads.map(self._answer, parts)])
@@ -199,19 +200,19 @@ class Pool:
         for _ in range(TRIES):
             with contextlib.suppress(Lost, OSError):
                 return Worker(self.command, self.size)
-        raise BadInput(
-            f"a worker process ended before it said anything, {TRIES} times: "
-            f"{' '.join(self.command)}"
-        )
+        raise BadInput(f"a worker process failed to start, {TRIES} times: {' '.join(self.command)}")
 
     def _count(self, rows: int) -> None:
         with self._counting:
             self.replaced += 1
-            said = f"worker {self.replaced} to be lost had {rows} rows; another takes its place"
-        warnings.warn(said, RuntimeWarning, stacklevel=2)
+            message = (
+                f"a worker with {rows} rows died or hung; another one replaces it "
+                f"({self.replaced} replaced so far)"
+            )
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
 
     def close(self) -> None:
-        """Ends all workers that are idle, and takes no more rows."""
+        """Ends all idle workers; the pool then accepts no more rows."""
         self._threads.shutdown()
         with contextlib.suppress(queue.Empty):
             while True:

@@ -20,46 +20,46 @@ R = TypeVar("R", bound=type[Robot])
 
 
 def register(kind: R) -> R:
-    """Makes a robot known by its name: to `--robot`, and to `load` of its controllers.
+    """Registers a robot by its name, for `--robot` and for loading its controllers.
 
-    It is a class decorator, for robots outside of genidm; genidm's own stand in `ROBOTS`.
+    A class decorator for robots outside genidm; genidm's own robots are listed in `ROBOTS`.
 
     Args:
-      kind: the class. It may be registered again, as a notebook does that runs a cell twice.
+      kind: the class. It may be registered again, as happens when a notebook cell runs twice.
 
     Returns:
       the class.
 
     Raises:
-      BadInput: a method of the contract is missing, or another robot has this name.
+      BadInput: a method or constant of the contract is missing, or another robot has this name.
     """
     registry.add(ROBOTS, kind, "robot")
     return kind
 
 
 def by_name(name: str, engine: str | None = None) -> Robot:
-    """The robot of that name, with its default settings.
+    """Makes the robot of this name, with its default settings.
 
     Args:
       name: one of `ROBOTS`.
-      engine: to step it with; the robot chooses, unless given.
+      engine: name of the engine that steps the robot; default: the robot's choice.
 
     Raises:
-      BadInput: there is none of that name, or that engine does not step it.
+      BadInput: no robot has this name, or the engine cannot step it.
     """
     if name not in ROBOTS:
         raise BadInput(f"no robot is called {name!r:.80}; there are: {', '.join(ROBOTS)}")
     kind: Any = ROBOTS[name]
     if engine is not None and not kind.engines:
-        raise BadInput(f"the {name} steps itself: it takes no engine {engine!r}")
+        raise BadInput(f"the {name} steps itself and takes no engine, got {engine!r}")
     return kind() if engine is None else kind(engine=engine)
 
 
 def remade(settings: dict[str, Any]) -> Robot:
-    """The robot whose `settings` a run's config holds.
+    """Makes a robot from the `settings` in a run's config.
 
     Raises:
-      BadInput: no robot has that name, or none can be made so.
+      BadInput: no robot has this name, or it does not accept the settings.
     """
     usual = by_name(settings["name"])
     given = {name: value for name, value in settings.items() if name != "name"}
@@ -67,11 +67,11 @@ def remade(settings: dict[str, Any]) -> Robot:
         arguments = {name: _like(usual.settings[name], value) for name, value in given.items()}
         return type(usual)(**arguments)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"this genidm makes no {usual.name} with {given}") from error
+        raise BadInput(f"this genidm cannot make the {usual.name} with {given}") from error
 
 
 def _like(model: Any, value: Any) -> Any:
-    """What `config.to_json` made of a setting, as it was before: a value of the model's kind."""
+    """Inverts `config.to_json` for one setting: `value` as an object of the type of `model`."""
     if isinstance(model, float):
         return float(value)  # "inf" is a string in JSON
     if not dataclasses.is_dataclass(model):

@@ -13,22 +13,22 @@ from genidm.robots.base import State
 from genidm.robots.mujoco import ASSETS, MujocoRobot
 from genidm.symmetry import Layout
 
-# Metres; what the reset noise can lower a foot by (0.1 of height, 0.1 rad at the ankle).
+# Metres by which the reset noise can lower a foot (0.1 of height, 0.1 rad at the ankle).
 START_CLEARANCE = 0.15
 
 
 class Ant(MujocoRobot):
-    """gymnasium's Ant.
+    """gymnasium's Ant (Table 1, A.1.1).
 
-    s `[111]` is 13 of the 15 numbers of qpos (without x and y), the 14 of qvel, and the
-    external wrench on each of the 14 bodies, the world counted, clipped to ±1: the layout
-    of gymnasium's Ant up to version 4. Two numbers differ from gymnasium's, so that every
-    field transforms exactly: quaternions have w ≥ 0, and a wrench's horizontal part is
-    clipped by its length, not by its components along the world's axes.
+    s `[111]` is qpos without x and y (13 numbers), qvel (14) and the external wrench on each of
+    the 14 bodies, the world included, clipped to ±1: the layout of gymnasium's Ant up to version
+    4. There are two differences from gymnasium, so that every field transforms exactly:
+    quaternions have w ≥ 0, and the horizontal part of a wrench is clipped by its length, not by
+    its components along the world's axes.
 
     Args:
-      solver: of the contacts.
-      engine: one of `engines`; chosen by what jax runs on, unless given.
+      solver: settings of the constraint solver.
+      engine: one of `engines`; default: chosen by hardware.
     """
 
     name = "ant"
@@ -46,8 +46,8 @@ class Ant(MujocoRobot):
 
     def rest_pose(self) -> np.ndarray:
         pose = self.mj_model.numeric("init_qpos").data.astype(np.float32)
-        # There the feet just touch the floor: noise would put some of them inside it, and the
-        # floor would throw the Ant above its healthy height before its first step is done.
+        # In gymnasium's pose the feet just touch the floor. Noise would move some feet into the
+        # floor, and in the first step the floor would throw the Ant above its healthy height.
         pose[2] += START_CLEARANCE
         return pose
 
@@ -65,10 +65,10 @@ class Ant(MujocoRobot):
 
 
 def clip_wrenches(wrenches: jax.Array) -> jax.Array:
-    """Wrenches `[n, 6]` with every number in ±1, in a way that commutes with a turn.
+    """Clips wrenches `[n, 6]` to ±1; clipping commutes with rotation about the vertical.
 
-    Clipping x and y each, as gymnasium does, follows the world's axes and would break
-    Def. 3; here the horizontal part of torque and of force is shortened to length 1.
+    gymnasium clips x and y separately. That depends on the world's axes and breaks Def. 3; here
+    the horizontal part of each torque and each force is shortened to length 1.
     """
     parts = wrenches.reshape(-1, 2, 3)
     length = symmetry.horizontal_norm(parts)[..., None]

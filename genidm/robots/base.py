@@ -1,7 +1,7 @@
-"""The Robot contract: a batch of lanes, each with one robot in it.
+"""The Robot contract: a batch of lanes, with one robot in each lane.
 
-Agents, 𝒢 and the evaluator know robots through this alone. A robot is pure: state in,
-state out, so the caller may jit, scan, shard or replay it at will.
+Agents, 𝒢 and the evaluator use robots only through this contract. The methods of a robot are
+pure functions of the state, so the caller may jit, scan, shard or replay them.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from genidm.symmetry import Layout
 
 
 class State(flax.struct.PyTreeNode):
-    """B robots after a reset, a step, or a placing.
+    """The state of B robots, after `reset`, `step` or `set_state`.
 
     Attributes:
-      physics: tree of arrays `[B, ...]`: all that the next step depends on.
+      physics: tree of arrays `[B, ...]`: everything that the next step depends on.
       observation: s `[B, S]`.
       position: o `[B, 3]`, of the base, metres, world frame.
-      heading: yaw `[B]`, radians: where the body's x axis points.
-      fallen: `[B]` bool; the episode ends here.
-      diverged: `[B]` bool; the physics left the finite numbers in this step. The other
-        fields then repeat the state before it, and the episode ends here.
+      heading: `[B]`, yaw of the body's x axis, radians.
+      fallen: `[B]` bool; the robot has fallen, and the episode ends.
+      diverged: `[B]` bool; the physics was not finite after this step, and the episode ends. The
+        other fields repeat the state before the step.
     """
 
     physics: Any
@@ -46,24 +46,24 @@ class State(flax.struct.PyTreeNode):
 
 
 class Robot(abc.ABC):
-    """What can be walked.
+    """A robot in simulation: resets, steps, costs, and how its numbers transform.
 
-    A robot is made without arguments, and takes `engine=` if it has `engines`
+    Every argument of a subclass has a default; a subclass with `engines` takes `engine=`
     (`genidm.robots.by_name`).
 
     Attributes:
-      name: lower case, as it stands in paths and on the command line.
+      name: name in paths and on the command line, lower case.
       observation: layout of s `[S]`.
       physics: tree of layouts, shaped like `State.physics`.
       action: layout of a `[A]`, in [−1, 1].
-      dt: seconds a step.
-      standing_height: metres; height of the base of a standing robot, and so of targets.
-      target_distance: metres, least and greatest, of the paper's test (A.1.3).
+      dt: seconds per control step.
+      standing_height: metres; height of the base of a standing robot, and of targets.
+      target_distance: metres; least and greatest target distance of the paper's test (A.1.3).
       healthy_reward: reward of a step without a fall.
-      paper_interactions: steps that the paper collects (A.1.2).
-      engines: names of the engines that can step it; none if it steps itself.
-      engine: the one that does; None if it steps itself.
-      settings: its name, and what it was made with, argument by argument: they name run
+      paper_interactions: environment steps that the paper collects (A.1.2).
+      engines: names of the engines that can step the robot; empty if it steps itself.
+      engine: the engine that steps the robot; None if it steps itself.
+      settings: its name and the arguments that it was made with. They enter the names of run
         directories, and `genidm.robots.remade` makes the robot again from them.
     """
 
@@ -87,46 +87,46 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
-        """Fresh starts, all different, near the origin.
+        """Draws initial states near the origin, a different one in every lane.
 
         Args:
-          keys: `[B]`, one a lane.
-          yaw: `[B]`, radians, that the start is turned by.
+          keys: `[B]`, one per lane.
+          yaw: `[B]`, radians by which the initial state is rotated about the vertical.
         """
 
     @abc.abstractmethod
     def step(self, state: State, action: jax.Array) -> State:
-        """One control step under actions `[B, A]`."""
+        """Makes one control step under actions `[B, A]`."""
 
     @abc.abstractmethod
     def set_state(self, physics: Any, yaw: jax.Array) -> State:
-        """Recorded physics, turned by `yaw [B]` about the vertical through the origin.
+        """The state with this physics, rotated by `yaw [B]` about the vertical through the origin.
 
-        Readings that only a step can give (contact forces) are zero until one is made.
+        Readings that only a step can measure (contact forces) are zero until the next step.
         """
 
     @abc.abstractmethod
     def cost(self, state: State, action: jax.Array) -> jax.Array:
-        """Control and contact costs `[B]` of the step that led to `state` under `action`."""
+        """Costs `[B]` (control, contacts) of the step that led to `state` under `action`."""
 
     def check_inputs(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
-        """s `[..., S]` as its controllers were taught it, with w ≥ 0 in its quaternions.
+        """Checks a controller's inputs; returns s with w ≥ 0 in its quaternions.
 
         Args:
-          s: of whoever asks for an action.
-          relative_goal: `[..., 3]`, the way that it asks for.
+          s: `[..., S]`, the observation.
+          relative_goal: `[..., 3]`, metres.
 
         Raises:
-          BadInput: their shapes do not fit the robot, or each other; or, outside of jitted
+          BadInput: their shapes do not fit the robot or each other; or, outside of jitted
             programs, a number is not finite.
         """
-        state, way = jnp.shape(s), jnp.shape(relative_goal)
-        if state[-1:] != (self.observation.size,) or way != (*state[:-1], 3):
-            wanted = f"s [..., {self.observation.size}] and a way [..., 3] in metres"
-            raise BadInput(f"the {self.name} is told {wanted}, not {state} and {way}")
-        for x, name in ((s, "s"), (relative_goal, "the way")):
+        state, goal = jnp.shape(s), jnp.shape(relative_goal)
+        if state[-1:] != (self.observation.size,) or goal != (*state[:-1], 3):
+            wanted = f"s [..., {self.observation.size}] and a relative goal [..., 3] in metres"
+            raise BadInput(f"the {self.name} takes {wanted}, got {list(state)} and {list(goal)}")
+        for x, name in ((s, "s"), (relative_goal, "the relative goal")):
             if not isinstance(x, jax.core.Tracer) and not np.isfinite(np.asarray(x)).all():
-                raise BadInput(f"{name} holds NaN or infinity: nothing steers the {self.name} so")
+                raise BadInput(f"{name} of the {self.name} holds NaN or infinity")
         return self.observation.canonical(jnp.asarray(s))
 
     def max_parallel_envs(self, lanes: int) -> int:
@@ -142,36 +142,36 @@ class Robot(abc.ABC):
 
     @property
     def engine_name(self) -> str | None:
-        """As `--engine` takes it; None if the robot steps itself."""
+        """Name of the engine, the value of `--engine`; None if the robot steps itself."""
         return self.engine.name if self.engine else None
 
     def mesh(self) -> Mesh:
-        """The jax devices that share its lanes, unless the caller names others."""
+        """The jax devices that share the lanes by default."""
         return self.engine.mesh() if self.engine else devices.mesh()
 
     def visual_model(self) -> mujoco.MjSpec:
-        """A MuJoCo model that shows what the robot looks like, the caller's to change.
+        """A new MuJoCo model of the robot's appearance; the caller may change it.
 
-        It is posed and looked at (`genidm.video`), never stepped; a robot on another engine
-        gives one that has its shape. Floor, lights and sky are the video's.
+        `genidm.video` sets its pose and renders it, and never steps it; a robot on another engine
+        returns a model of the same shape. `genidm.video` adds floor, lights and sky.
 
         Raises:
-          BadInput: nobody has said what the robot looks like.
+          BadInput: the robot has no visual model.
         """
-        raise BadInput(f"there is nothing to render: the {self.name} has no visual model")
+        raise BadInput(f"the {self.name} cannot be rendered: it has no visual model")
 
     def visual_qpos(self, physics: Any) -> np.ndarray:
-        """qpos `[..., nq]` in which the visual model shows `physics [...]`, metres and radians.
+        """qpos `[..., nq]` of the visual model for `physics [...]`, metres and radians.
 
-        It is asked on the host, for recorded physics: it need not be traceable.
+        It runs on the host, on recorded physics, so it need not be traceable.
 
         Raises:
           BadInput: as for `visual_model`.
         """
-        raise BadInput(f"there is nothing to render: the {self.name} has no visual model")
+        raise BadInput(f"the {self.name} cannot be rendered: it has no visual model")
 
     def rotate_physics(self, physics: Any, yaw: jax.Array) -> Any:
-        """Physics after the world is turned by `yaw [B]`."""
+        """Physics after the world is rotated by `yaw [B]` about the vertical."""
         return jax.tree.map(lambda layout, x: layout.rotate(x, yaw), self.physics, physics)
 
     def mirror_physics(self, physics: Any) -> Any:
@@ -180,7 +180,7 @@ class Robot(abc.ABC):
 
 
 def select(mask: jax.Array, yes: Any, no: Any) -> Any:
-    """Lane by lane, the tree `yes` where `mask [B]` holds and `no` elsewhere."""
+    """Selects lane by lane from two trees: `yes` where `mask [B]` holds, `no` elsewhere."""
 
     def pick(a: jax.Array, b: jax.Array) -> jax.Array:
         if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):

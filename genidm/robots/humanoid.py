@@ -1,4 +1,4 @@
-"""The Humanoid: PyBullet's, in MuJoCo; seventeen torques, a 43-D state (Table 1, A.1.1)."""
+"""The Humanoid: PyBullet's model in MuJoCo; 17 torques, a 43-D state (Table 1, A.1.1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from genidm.symmetry import Layout
 
 Frame = Literal["heading", "world"]
 
-# PyBullet's motors, in its order: name, and power in N·m (pybullet_envs, robot_locomotors.py).
+# PyBullet's motors in its order: name, and "power" in N·m (pybullet_envs, robot_locomotors.py).
 POWER = {
     "abdomen_z": 100, "abdomen_y": 100, "abdomen_x": 100,
     "right_hip_x": 100, "right_hip_z": 100, "right_hip_y": 300, "right_knee": 200,
@@ -27,33 +27,33 @@ POWER = {
     "right_shoulder1": 75, "right_shoulder2": 75, "right_elbow": 75,
     "left_shoulder1": 75, "left_shoulder2": 75, "left_elbow": 75,
 }  # fmt: skip
-# Of its power, the share that a motor may use.
+# The share of its power that a motor may use (pybullet_envs, robot_locomotors.py).
 STRENGTH = 0.41
-# What Brax's file has otherwise on one side of the body, or than PyBullet's: degrees, N·m/rad,
-# kg·m².
+# Values for both sides, where Brax's file differs between the sides or from PyBullet's: degrees,
+# N·m/rad, kg·m².
 HIP_RANGE = (-120.0, 20.0)
 KNEE_STIFFNESS = 1.0
 HIP_ARMATURE = 0.01
-# Metres, in the torso's frame: PyBullet counts the base from its lowest geom's centre.
+# Metres, in the torso's frame: PyBullet's base is at the centre of the torso's lowest geom.
 BASE = np.array([-0.01, 0.0, -0.12])
-# Newtons: a foot that presses less is in the air.
+# Newtons: the least force at which a foot counts as on the floor.
 TOUCH = 1.0
 
 
 class Humanoid(MujocoRobot):
-    """PyBullet's humanoid in MuJoCo.
+    """PyBullet's humanoid in MuJoCo (Table 1, A.1.1).
 
-    s `[43]` is PyBullet's state with the yaw itself in place of the direction to its target:
-    height − 0.8 m, 0.3 × velocity, roll, pitch, yaw, then for each joint its angle between
-    its limits (−1 to 1) and 0.1 × its velocity, and whether each foot touches the floor.
+    s `[43]` is PyBullet's state, with the yaw in place of the direction to the target: height −
+    0.8 m, 0.3 × velocity, roll, pitch, yaw; for each joint its angle relative to its limits (−1
+    to 1) and 0.1 × its velocity; and whether each foot touches the floor.
 
     Args:
-      solver: of the contacts.
-      engine: one of `engines`; chosen by what jax runs on, unless given.
+      solver: settings of the constraint solver.
+      engine: one of `engines`; default: chosen by hardware.
 
     Attributes:
-      velocity: its frame in s. PyBullet turns it by the yaw, which takes from the LFM some of
-        what it is to learn; `HumanoidWorld` leaves that to be learned.
+      velocity: frame of the velocity in s. PyBullet's is the heading frame, which is already
+        invariant to the yaw; in `HumanoidWorld` the LFM has to learn this invariance.
     """
 
     name = "humanoid"
@@ -74,7 +74,7 @@ class Humanoid(MujocoRobot):
     def __init__(self, solver: Solver | None = None, engine: str | None = None):
         super().__init__(solver, engine)
         limits = self.mj_model.jnt_range[1:]
-        self._middle, self._reach = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
+        self._middle, self._half_range = limits.mean(1), (limits[:, 1] - limits[:, 0]) / 2
         self._feet = np.array([self.mj_model.body(f"{side}_foot").id for side in ("right", "left")])
 
     def _specify(self, solver: Solver) -> mujoco.MjSpec:
@@ -99,11 +99,11 @@ class Humanoid(MujocoRobot):
 
     def rest_pose(self) -> np.ndarray:
         pose = self.mj_model.qpos0.astype(np.float32)
-        pose[:3] = 0.0, 0.0, 1.4  # PyBullet's start, from which it drops onto its feet
+        pose[:3] = 0.0, 0.0, 1.4  # PyBullet's initial height: the robot drops onto its feet
         return pose
 
     def _draw(self, key: jax.Array) -> Physics:
-        """PyBullet's start: upright and at rest, with uniform noise in the joints."""
+        """PyBullet's initial state: upright and at rest, with uniform noise in the joints."""
         noise, count = self.reset_noise, len(self.mirror.hinges)
         angles = jax.random.uniform(key, (count,), jnp.float32, -noise, noise)
         qpos = jnp.asarray(self._rest).at[7:].add(angles)
@@ -115,7 +115,7 @@ class Humanoid(MujocoRobot):
         velocity = physics.qvel[:3]
         if self.velocity == "heading":
             velocity = symmetry.rotate_vector(velocity, -angles[2])
-        place = (physics.qpos[7:] - self._middle) / self._reach
+        place = (physics.qpos[7:] - self._middle) / self._half_range
         joints = jnp.stack([place, 0.1 * physics.qvel[6:]], axis=-1).reshape(-1)
         touching = jnp.linalg.norm(contact[self._feet, 3:], axis=-1) > TOUCH
         height = physics.qpos[2:3] - 0.8
@@ -123,7 +123,7 @@ class Humanoid(MujocoRobot):
         return jnp.clip(s, -5.0, 5.0)
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:
-        """What PyBullet charges for power, torque, and joints at their limits."""
+        """PyBullet's costs `[B]` of power, torque, and joints at their limits."""
         joints = self.observation.part(state.observation, "joint angles, velocities")
         place, rate = joints[..., 0::2], joints[..., 1::2]
         power = self.electricity_cost * jnp.mean(jnp.abs(action * rate), axis=-1)
@@ -132,14 +132,14 @@ class Humanoid(MujocoRobot):
 
 
 class HumanoidWorld(Humanoid):
-    """The Humanoid with its velocity in the world's frame: the harder problem."""
+    """The Humanoid with its velocity in the world's frame, which makes the problem harder."""
 
     name = "humanoid_world"
     velocity = "world"
 
 
 def edited(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Brax's humanoid with PyBullet's motors, limits, time step and base; both sides alike."""
+    """Edits Brax's humanoid: PyBullet's motors, limits, time step and base; symmetric sides."""
     spec.option.timestep = Humanoid.dt / Humanoid.frame_skip
     for side in ("right", "left"):
         spec.joint(f"{side}_hip_y").range = HIP_RANGE

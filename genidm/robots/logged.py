@@ -1,4 +1,4 @@
-"""A robot known by its logs alone: how its numbers transform, and no simulator."""
+"""A robot with logs and without a simulator."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from genidm.robots.base import Robot, State
 
 
 class Logged(Robot):
-    """What turns logs into a controller without a simulator.
+    """A robot with logs and without a simulator.
 
-    A subclass names itself and its `dt` and `standing_height`, and says how the
-    numbers of s and of a transform (`observation`, `action`). Its logs can be turned
-    (`Generalize(mode="rotate")`) and fitted; what would step it is refused.
+    A subclass defines `name`, `dt`, `standing_height` and the layouts of s and a (`observation`,
+    `action`). Its logs can be rotated (`Generalize(mode="rotate")`) and fitted. Methods that need
+    a simulator raise BadInput.
     """
 
     target_distance = (2.0, 5.0)
@@ -35,4 +35,4 @@ class Logged(Robot):
         raise self._refusal()
 
     def _refusal(self) -> BadInput:
-        return BadInput(f"the {self.name} is known by its logs alone: there is nothing to step")
+        return BadInput(f"the {self.name} cannot be stepped: it has logs, but no simulator")

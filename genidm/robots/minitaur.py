@@ -28,27 +28,27 @@ from genidm.symmetry import Layout
 
 Observed = Literal["paper17", "native28"]
 
-# In each leg L is the outer motor on the left of the body and the inner one on the right, so
-# that the mirror image of front left L is front right R.
+# On the left of the body, L is the outer motor of a leg; on the right, L is the inner motor. So
+# the mirror image of front left L is front right R.
 ACROSS = [5, 4, 7, 6, 1, 0, 3, 2]
 LEG_ACROSS = [2, 3, 0, 1]
-# Seconds that a worker may take for the robots it is given at once: a thousand times the usual.
+# Seconds that a worker may take for one request, about a thousand times the usual time.
 PATIENCE = 30.0
 
 ABSENT = (
-    'the Minitaur needs PyBullet, which is not installed: `pip install "genidm[minitaur]"` brings'
-    " it for CPython 3.11 on Linux x86-64; for others there is no wheel of pybullet 3.2.7, and pip"
-    " has to build it"
+    'the Minitaur needs PyBullet, which is not installed: run `pip install "genidm[minitaur]"`'
+    " (pybullet 3.2.7 has a wheel only for CPython 3.11 on Linux x86-64; elsewhere pip builds it)"
 )
 
 
 class Physics(flax.struct.PyTreeNode):
-    """All that a step in PyBullet depends on; `genidm.robots.minitaur_world.ROW`, number by number.
+    """Everything that a step in PyBullet depends on, in the order of `minitaur_world.ROW`.
 
     Attributes:
       pose: `[B, 23]`; base position (m) and quaternion, then joint angles (rad).
       motion: `[B, 22]`; base velocity (m/s) and spin (rad/s), then joint velocities (rad/s).
-      motors: `[B, 16]`; physics steps that each motor has been hot for, torques observed (N·m).
+      motors: `[B, 16]`; for each motor the number of successive physics steps above the torque
+        `minitaur_world.HOT`, then the observed torques (N·m).
     """
 
     pose: Any
@@ -57,7 +57,7 @@ class Physics(flax.struct.PyTreeNode):
 
 
 def joints(name: str, unit: str) -> symmetry.Field:
-    """One number for each of the eight motors, or of the knees below them."""
+    """A field with one number for each of the eight motors, or each of their knees."""
     return symmetry.joints(name, ACROSS, [1] * 8, unit)
 
 
@@ -92,31 +92,31 @@ OBSERVATIONS = {
 
 
 class Minitaur(Robot):
-    """The Minitaur of pybullet_envs, stepped by processes of this machine.
+    """The Minitaur of pybullet_envs, stepped by local worker processes (Table 1, A.1.1).
 
-    The action `[8]` goes through the leg model of pybullet_envs: how far each leg swings
-    (±45° at ±1), then how far it is drawn in, for the legs front left, back left, front
-    right, back right. A DC motor model turns the angles that it asks for into torques.
+    The leg model of pybullet_envs maps the action `[8]` to motor angles: first the swing of each
+    leg (±45° at ±1), then its retraction (45° of both motors at 1), for the legs front left, back
+    left, front right, back right. A DC motor model computes the torques from these angles.
 
-    A step is a function of `State.physics` alone. Each robot is put into its state anew, in
-    whichever process is free, and makes five physics steps there: so a robot can be placed,
-    replayed and resumed at no cost, and a process that dies takes nothing with it. What
-    it costs is the contacts that Bullet keeps from one step to the next (docs/physics.md).
+    A step is a function of `State.physics` alone. For every step a free process sets the robot's
+    state and makes five physics steps. So states can be set, replayed and resumed at no cost, and
+    a process that dies loses nothing. But the contacts that Bullet keeps from step to step are
+    lost (docs/physics.md).
 
-    The model is nearly its own mirror image, not quite: on the left of the body a knee is
-    joined 5 mm from where it would be on the right, and one motor of eight, front left R,
-    has no inertia of its own. How far that takes it in a mirrored replay is in docs/physics.md.
+    The model is not exactly its own mirror image: the shins of a leg are joined with an offset of
+    5 mm, towards the same side in all legs, and one of the eight motors, front left R, has almost
+    no inertia. docs/physics.md measures the effect on a mirrored replay.
 
     Args:
       solver: settings of Bullet.
-      engine: "bullet"; there is no other.
-      observed: s. "paper17": motor angles (8), the base's velocity (3) and spin (3) in the
-        world frame, roll, pitch and yaw. "native28": that of pybullet_envs, motor angles,
-        velocities and observed torques (8 each), and a quaternion, here as (w, x, y, z), w ≥ 0.
-      processes: that step robots; one for each core, unless given.
+      engine: "bullet", the only engine.
+      observed: content of s. "paper17": motor angles (8), the base's velocity (3) and spin (3) in
+        the world frame, roll, pitch and yaw. "native28", as in pybullet_envs: motor angles,
+        velocities and observed torques (8 each), and a quaternion, here (w, x, y, z) with w ≥ 0.
+      processes: number of worker processes; default: one for each core.
 
     Raises:
-      BadInput: PyBullet is not installed, or `observed` is neither.
+      BadInput: PyBullet is not installed, or `observed` is unknown.
     """
 
     name = "minitaur"
@@ -124,10 +124,11 @@ class Minitaur(Robot):
     standing_height = 0.2
     target_distance = protocol.TARGET_DISTANCE["minitaur"]
     paper_interactions = protocol.INTERACTIONS["minitaur"]
-    # pybullet_envs has none. With a horizon of a second (discount 0.99), a lunge at 1 m/s that
-    # ends in a fall would else be worth more than any walk.
+    # pybullet_envs has none. But with a horizon of one second (discount 0.99), a jump forward at
+    # 1 m/s that ends in a fall would then return more than any gait.
     healthy_reward = 0.5
-    # Of the base's start, m/s and rad/s; pybullet_envs has none, and starts that are all alike.
+    # Standard deviation of the base's initial velocity, m/s and rad/s. pybullet_envs has none: all
+    # its initial states are equal.
     reset_noise = 0.1
 
     physics = Physics(POSE, MOTION, MOTORS)
@@ -151,7 +152,7 @@ class Minitaur(Robot):
         if importlib.util.find_spec("pybullet") is None:
             raise BadInput(ABSENT)
         if observed not in OBSERVATIONS:
-            raise BadInput(f"observed is {' or '.join(OBSERVATIONS)}, not {observed!r}")
+            raise BadInput(f"observed must be {' or '.join(OBSERVATIONS)}, not {observed!r}")
         solver = solver or Solver()
         chosen = engines.choose(engine, self.engines, self.name)
         self.settings = {
@@ -162,31 +163,31 @@ class Minitaur(Robot):
 
     @functools.cached_property
     def _rest(self) -> Physics:
-        """The settled start, `[...]` of one robot, at yaw 0."""
+        """Physics `[...]` of one robot, settled on the floor, at yaw 0."""
         return from_rows(jnp.asarray(self.engine.pool.greeting()))
 
     def visual_model(self) -> mujoco.MjSpec:
-        """PyBullet's own model, as MuJoCo reads it: its boxes and cylinders."""
+        """PyBullet's own model, read by MuJoCo: its boxes and cylinders."""
         import pybullet_data
 
         spec = mujoco.MjSpec.from_file(str(Path(pybullet_data.getDataPath()) / world.URDF))
-        spec.compiler.fusestatic = False  # the base is a body, and no part of the floor
+        spec.compiler.fusestatic = False  # else MuJoCo fuses the base with the world
         spec.bodies[1].add_freejoint()
         return spec
 
     def visual_qpos(self, physics: Physics) -> np.ndarray:
         pose = np.asarray(physics.pose)
         angles = pose[..., 7:] * np.tile(world.DIRECTION, 2)
-        return np.concatenate([pose[..., :7], angles[..., self._drawn]], axis=-1)
+        return np.concatenate([pose[..., :7], angles[..., self._visual_joints]], axis=-1)
 
     @functools.cached_property
-    def _drawn(self) -> list[int]:
-        """For each hinge of the visual model, which of our joints it is."""
+    def _visual_joints(self) -> list[int]:
+        """For each hinge of the visual model, its index among our joints."""
         model, names = self.visual_model().compile(), world.MOTORS + world.KNEES
         return [names.index(model.joint(i).name) for i in range(1, model.njnt)]
 
     def reset(self, keys: jax.Array, yaw: jax.Array) -> State:
-        """The settled start of pybullet_envs, the base given a slight push."""
+        """The settled initial state of pybullet_envs, with noise in the base's velocity."""
         with jax.ensure_compile_time_eval():
             rest = self._rest
         push = jax.vmap(lambda key: jax.random.normal(key, (6,), jnp.float32))(keys)
@@ -197,7 +198,7 @@ class Minitaur(Robot):
 
     def set_state(self, physics: Physics, yaw: jax.Array) -> State:
         state = self._state(self.rotate_physics(physics, yaw))
-        # A start is not judged.
+        # An initial state is never a fall.
         return state.replace(fallen=jnp.zeros_like(state.fallen))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -228,14 +229,14 @@ class Minitaur(Robot):
         return jnp.concatenate([known[f.name] for f in self.observation.fields], axis=-1)
 
     def cost(self, state: State, action: jax.Array) -> jax.Array:
-        """What pybullet_envs charges for energy, a second."""
+        """The energy cost `[B]` of pybullet_envs, per second."""
         torque = MOTORS.part(state.physics.motors, "torque")
         rate = MOTION.part(state.physics.motion, "motor velocities")
         return world.charge(torque, rate) / self.dt
 
 
 def from_rows(rows: jax.Array) -> Physics:
-    """Physics of rows `[..., 61]`; quaternions with w ≥ 0."""
+    """Splits rows `[..., 61]` into Physics; quaternions get w ≥ 0."""
     pose, motion, motors = jnp.split(rows, [POSE.size, POSE.size + MOTION.size], axis=-1)
     upright = symmetry.canonical_quaternion(pose[..., 3:7])
     return Physics(pose.at[..., 3:7].set(upright), motion, motors)
@@ -243,9 +244,9 @@ def from_rows(rows: jax.Array) -> Physics:
 
 @functools.cache
 def bullet(solver: Solver, processes: int | None) -> Bullet:
-    """The processes that step robots under these settings, shared by all that ask for them."""
+    """The engine for these settings; all robots with the same settings share its processes."""
     settings = json.dumps(dataclasses.asdict(solver))
-    # -P: the worker's own directory is no place to import from.
+    # -P: without it the worker would import from genidm/robots first.
     command = [sys.executable, "-P", world.__file__, settings, str(PATIENCE)]
     made = Bullet(command, world.WIDTH, processes, PATIENCE)
     atexit.register(made.pool.close)

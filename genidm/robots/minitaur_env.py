@@ -1,6 +1,6 @@
-"""The Minitaur as a `gymnasium.Env`, for other learners than those of this package.
+"""The Minitaur as a `gymnasium.Env`, for learners of other packages.
 
-env = gymnasium.vector.AsyncVectorEnv([MinitaurEnv] * 8)   # a process each
+env = gymnasium.vector.AsyncVectorEnv([MinitaurEnv] * 8)   # one process per environment
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from genidm.robots.minitaur_world import ACTIONS, Simulation, Solver, charge, ha
 
 
 class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One Minitaur that is rewarded for walking towards +x, as in pybullet_envs.
+    """One Minitaur with the task of pybullet_envs: walk towards +x.
 
-    The reward of a step is Δx − 0.005 |τ·q̇| Δt, Δt being one physics step; the episode
-    ends with a fall, and has no time limit (`gymnasium.wrappers.TimeLimit`). Observations
-    and actions are those of `genidm.robots.Minitaur`, and so is the motion, but for the
-    contacts that Bullet keeps from one step to the next: nothing is placed anew here.
+    The reward of a step is Δx − 0.005 |τ·q̇| Δt, where Δt is one physics step. The episode ends
+    with a fall and has no time limit (use `gymnasium.wrappers.TimeLimit`). Observations and
+    actions are those of `genidm.robots.Minitaur`. Its motion differs in one point: the state is
+    not set before every step, so Bullet keeps contacts from one step to the next.
 
     Args:
       solver: settings of Bullet.
-      observed: s, "paper17" or "native28".
+      observed: content of s, "paper17" or "native28".
     """
 
     def __init__(self, solver: Solver | None = None, observed: Observed = "paper17"):
@@ -39,12 +39,12 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A hard reset.
+        """Loads the simulation anew and returns the first observation.
 
         Args:
-          seed: has no effect: all starts are alike.
-          options: "yaw", radians, that the start faces (0); or "row" `[61]`, a state to be
-            placed in (`genidm.robots.minitaur_world.ROW`).
+          seed: no effect, because all initial states are equal.
+          options: "yaw", the initial yaw in radians (default 0); or "row" `[61]`, the initial
+            state (`genidm.robots.minitaur_world.ROW`).
         """
         super().reset(seed=seed)
         options = options or {}
@@ -60,11 +60,11 @@ class MinitaurEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         except (TypeError, ValueError):
             action = np.full(0, np.nan)
         if action.shape != (ACTIONS,) or not np.isfinite(action).all():
-            raise BadInput(f"an action is {ACTIONS} finite numbers, not {given!r:.80}")
+            raise BadInput(f"an action must be {ACTIONS} finite numbers, not {given!r:.80}")
         before = last[0]
         self.simulation.step(action)
         row = self.simulation.read()
-        if not np.isfinite(row).all():  # nothing can be seen of it any more
+        if not np.isfinite(row).all():  # such a row has no observation
             return self._observe(parts(last)), 0.0, True, False, {"row": row}
         x = parts(row)
         reward = x["position"][0] - before - charge(x["torque"], x["rates"][:8])

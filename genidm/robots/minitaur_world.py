@@ -1,11 +1,11 @@
 """One Minitaur in PyBullet: the model of `pybullet_envs`, without gym.
 
-Run as a script this file is a worker, which steps whatever robots it is sent (`serve`). So it
-imports nothing of genidm: a worker starts in half a second, and holds neither jax nor a model.
+As a script, this file is a worker process that steps the robots it receives (`serve`). So it does
+not import genidm: a worker starts in half a second, without jax.
 
-Bullet's world is the frame: z up, metres, radians. Joints are counted as the motors are: by
-leg, front left, back left, front right, back right, in each leg L before R, with the sign
-that makes both sides alike.
+Coordinates are those of Bullet's world: z up, metres, radians. Joints have the order of the
+motors: by leg, front left, back left, front right, back right, and in each leg L before R. Their
+signs are such that equal angles mean symmetric legs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-# ── constants, all of pybullet_envs (bullet/minitaur.py, motor.py, minitaur_gym_env.py) ─────
+# ── constants of pybullet_envs (bullet/minitaur.py, motor.py, minitaur_gym_env.py) ──────────
 
 URDF = "quadruped/minitaur.urdf"  # in pybullet_data
 LEGS = ("front_left", "back_left", "front_right", "back_right")
@@ -35,44 +35,44 @@ MOTORS = [f"motor_{leg}{side}_joint" for leg in LEGS for side in "LR"]
 KNEES = [f"knee_{leg}{side}_link" for leg in LEGS for side in "LR"]
 DIRECTION = np.repeat([-1.0, 1.0], 4)
 
-SUBSTEP = 0.002  # s; the motors are commanded at each
-SUBSTEPS = 5  # a control step
+SUBSTEP = 0.002  # s, one physics step; each computes the motors' torques anew
+SUBSTEPS = 5  # physics steps per control step
 GRAVITY = -10.0  # m/s²
 START_HEIGHT = 0.2  # m
-SETTLING = 100  # physics steps with every motor told to stay at a quarter turn
+SETTLING = 100  # physics steps of a reset in which every motor holds MOTOR_START
 MOTOR_START, KNEE_START = math.pi / 2, -2.1834  # rad
-# Where the two shins of a leg are joined, in the frame of each, metres.
+# Metres; the point that joins the two shins of a leg, in the frame of each shin.
 JOINED_RIGHT, JOINED_LEFT = (0.0, 0.005, 0.2), (0.0, 0.01, 0.2)
 
-KP, KD = 1.0, 0.02  # of full voltage a rad, a rad/s
+KP, KD = 1.0, 0.02  # share of full voltage per rad, per rad/s
 VOLTAGE, VOLTAGE_CLIP = 16.0, 50.0  # V
 RESISTANCE = 0.186  # Ω
 TORQUE_CONSTANT = 0.0954  # N·m/A, and V·s/rad
-OBSERVED_LIMIT = 5.7  # N·m, of the torque that the sensor gives
-CURRENTS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)  # A, and the torque at each:
-TORQUES = (0.0, 1.0, 1.9, 2.45, 3.0, 3.25, 3.5)  # N·m
-# A motor that gives more than so many N·m for over a second (in physics steps) is off for good.
+OBSERVED_LIMIT = 5.7  # N·m, limit of the observed torque
+CURRENTS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)  # A
+TORQUES = (0.0, 1.0, 1.9, 2.45, 3.0, 3.25, 3.5)  # N·m, at these currents
+# Overheating: a motor above HOT N·m for more than PATIENT physics steps (1 s) is off for good.
 HOT, PATIENT = 2.45, 1.0 / SUBSTEP
 
-SWING = np.array([1, -1, 1, -1, -1, 1, -1, 1])  # which way a motor turns to swing its leg
-EXTENSION_OFFSET = 1.5  # of the leg model: legs stand half bent at action 0
+SWING = np.array([1, -1, 1, -1, -1, 1, -1, 1])  # sign of each motor's part in its leg's swing
+EXTENSION_OFFSET = 1.5  # of the leg model: legs are half bent at action 0
 FALLEN_UP, FALLEN_HEIGHT = 0.85, 0.13  # cosine of the tilt; m
-ENERGY_WEIGHT = 0.005  # of a joule, against a metre
+ENERGY_WEIGHT = 0.005  # metres of reward per joule
 
-# Metres, rad/s, and so on: beyond, or where there is no number at all, the physics is lost.
+# The simulation has failed if a number of its state is beyond this bound, or not finite.
 ABSURD = 1e4
-# Where nothing touches, metres: what lies still there has no contacts.
+# Metres; high enough above the floor that a robot there has no contacts.
 ALOFT = 50.0
 
 ROW = {
     "position": 3, "orientation": 4, "angles": 16, "velocity": 3, "spin": 3, "rates": 16,
     "heat": 8, "torque": 8,
 }  # fmt: skip
-"""All that a step depends on, and how many numbers each takes in a row `[61]`.
+"""Everything that a step depends on: name → count of its numbers in a row `[61]`.
 
 Base position (m), orientation (w, x, y, z), joint angles (rad, motors before knees); base
-velocity (m/s) and spin (rad/s) in the world frame, joint velocities (rad/s); for how many
-physics steps each motor has been hot; the torque that its sensor gave last (N·m).
+velocity (m/s) and spin (rad/s) in the world frame, joint velocities (rad/s); for each motor the
+number of successive physics steps above HOT, and its last observed torque (N·m).
 """
 WIDTH = sum(ROW.values())
 ACTIONS = 8
@@ -83,13 +83,13 @@ REST = np.repeat([MOTOR_START, KNEE_START], 8)
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """Settings of Bullet, chosen by measuring (docs/physics.md).
+    """Settings of Bullet, chosen by measurement (docs/physics.md).
 
     Attributes:
-      iterations: of the constraint solver; 60 is that of pybullet_envs.
-      self_collision: legs collide with each other and the body, as in pybullet_envs.
-      cone: true friction cones, as in pybullet_envs. Off, a turned replay stays near the
-        record for longer.
+      iterations: iterations of the constraint solver; pybullet_envs has 60, too.
+      self_collision: whether legs collide with each other and the body, as in pybullet_envs.
+      cone: whether friction cones are round, as in pybullet_envs. Without round cones, a rotated
+        replay stays close to the record for longer.
     """
 
     iterations: int = 60
@@ -98,15 +98,15 @@ class Solver:
 
 
 def parts(row: np.ndarray) -> dict[str, np.ndarray]:
-    """The numbers of a row `[61]` by name, as ROW has them."""
+    """Splits a row `[61]` into its parts, by the names in ROW."""
     return dict(zip(ROW, np.split(row, np.cumsum([*ROW.values()])[:-1]), strict=True))
 
 
 def motor_angles(action: np.ndarray) -> np.ndarray:
-    """The leg model: motor angles `[8]` in radians that an action `[8]` in [−1, 1] asks for.
+    """The leg model: motor angles `[8]`, radians, for an action `[8]` in [−1, 1].
 
-    Of each leg, the action has first how far it swings, ±45° at 1, and in its second half how
-    far it stretches, 45° of both motors at 1.
+    The first half of the action is the swing of each leg, ±45° at ±1; the second half is its
+    retraction, 45° of both motors at 1 (pybullet_envs calls it extension).
     """
     swing, extension = np.repeat(np.clip(action, -1.0, 1.0).reshape(2, 4), 2, axis=1)
     return math.pi + math.pi / 4 * (SWING * swing - extension - EXTENSION_OFFSET)
@@ -115,12 +115,12 @@ def motor_angles(action: np.ndarray) -> np.ndarray:
 def motor_torques(
     command: np.ndarray, angle: np.ndarray, rate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The DC motors under position control: torque given and torque observed, `[8]`, N·m.
+    """The DC motors under position control: torques applied and observed, each `[8]`, N·m.
 
     Args:
-      command: `[8]`, rad.
-      angle: `[8]`, rad.
-      rate: `[8]`, rad/s.
+      command: desired motor angles `[8]`, rad.
+      angle: motor angles `[8]`, rad.
+      rate: motor velocities `[8]`, rad/s.
     """
     duty = np.clip(-KP * (angle - command) - KD * rate, -1.0, 1.0)
     observed = TORQUE_CONSTANT * (duty * VOLTAGE / RESISTANCE)
@@ -137,20 +137,20 @@ def has_fallen(orientation: Any, height: Any) -> Any:
 
 
 def charge(torque: Any, rate: Any) -> Any:
-    """What a control step is charged for energy `[...]`, in the reward's metres.
+    """Energy cost `[...]` of a control step, in metres of reward, as in pybullet_envs.
 
-    0.005 |τ·q̇| Δt, where Δt is one physics step of the five, the last, as in pybullet_envs.
+    0.005 |τ·q̇| Δt, where τ, q̇ and Δt are those of the last of the five physics steps.
 
     Args:
-      torque: `[..., 8]`, as observed, N·m.
-      rate: `[..., 8]`, rad/s.
+      torque: observed torques `[..., 8]`, N·m.
+      rate: motor velocities `[..., 8]`, rad/s.
     """
     return ENERGY_WEIGHT * abs((torque * rate).sum(-1)) * SUBSTEP
 
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Lets nothing through to stdout and stderr: PyBullet greets on both, from C."""
+    """Discards stdout and stderr of the process: PyBullet prints to both from C."""
     flush = ctypes.CDLL(None).fflush
     flush(None)
     kept, nowhere = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
@@ -167,7 +167,7 @@ def silence() -> Iterator[None]:
 
 
 class Client:
-    """PyBullet's functions, of one physics server of the many that a process may have."""
+    """PyBullet's functions, bound to one physics server; a process may have several."""
 
     def __init__(self, pybullet: Any, server: int):
         self._pybullet, self._server = pybullet, server
@@ -181,9 +181,9 @@ class Client:
 
 
 class Simulation:
-    """A Minitaur on a plane; it goes on from where it is, as simulations do.
+    """A Minitaur on a plane, with a state that `step` advances.
 
-    It starts anew by `reset`, which loads everything afresh, or by `set_state`, in any state.
+    `reset` loads the simulation anew; `set_state` sets any state.
 
     Args:
       solver: settings of Bullet.
@@ -203,7 +203,7 @@ class Simulation:
         self.reset()
 
     def reset(self, yaw: float = 0.0) -> None:
-        """The start of pybullet_envs, facing `yaw` (rad): all is loaded, dropped, and settled."""
+        """Loads the robot at `yaw` (rad) and lets it settle on the floor, as in pybullet_envs."""
         self.bullet.resetSimulation()
         self._load(yaw)
         self.heat, self.torque = np.zeros(8), np.zeros(8)
@@ -216,7 +216,7 @@ class Simulation:
         bullet, solver = self.bullet, self.solver
         bullet.setPhysicsEngineParameter(
             numSolverIterations=solver.iterations, enableConeFriction=int(solver.cone),
-            # The order of contacts is that of the robot's links, not of what came before.
+            # Orders contacts by links; else their order depends on earlier steps.
             deterministicOverlappingPairs=1,
         )  # fmt: skip
         bullet.setTimeStep(SUBSTEP)
@@ -244,24 +244,24 @@ class Simulation:
                 body, right, body, left, bullet.JOINT_POINT2POINT, [0, 0, 0],
                 JOINED_RIGHT, JOINED_LEFT,
             )  # fmt: skip
-        # Bullet's own motors, which brake every joint unless they are told not to.
+        # Switches off Bullet's default motors, which brake every joint.
         bullet.setJointMotorControlArray(
             body, self.motors + self.knees, bullet.VELOCITY_CONTROL,
             targetVelocities=[0] * 16, forces=[0] * 16,
         )  # fmt: skip
 
     def _set_joints(self, angles: np.ndarray, rates: np.ndarray) -> None:
-        """Angles and rates `[16]`, motors before knees."""
+        """Sets angles (rad) and rates (rad/s), each `[16]`, motors before knees."""
         q, v = (x * np.tile(DIRECTION, 2) for x in (angles, rates))
         self.bullet.resetJointStatesMultiDof(
             self.body, self.motors + self.knees, q[:, None].tolist(), v[:, None].tolist()
         )
 
     def set_state(self, row: np.ndarray) -> None:
-        """Puts the robot into the state that `row [61]` says.
+        """Sets the state to `row [61]`.
 
-        What follows depends on the row alone, to the last bit: Bullet keeps contacts from one
-        step to the next, so those of before are got rid of first, high up in the air.
+        All later steps depend on the row alone, to the last bit. Bullet keeps contacts from step
+        to step, so the robot is first moved into the air, where it loses its contacts.
         """
         x = parts(row.astype(np.float64))
         self._set_joints(REST, np.zeros(16))
@@ -283,18 +283,18 @@ class Simulation:
         )
 
     def _joints(self, joints: list[int]) -> np.ndarray:
-        """Angles and rates `[2, joints]`, as Bullet counts them."""
+        """Angles and rates `[2, joints]`, with Bullet's signs."""
         states = self.bullet.getJointStates(self.body, joints)
         return np.array([state[:2] for state in states]).T
 
     def step(self, action: np.ndarray) -> None:
-        """One control step under an action `[8]`."""
+        """Makes one control step under an action `[8]`."""
         command = motor_angles(action)
         for _ in range(SUBSTEPS):
             self._drive(command)
 
     def _drive(self, command: np.ndarray) -> None:
-        """One physics step, the motors told to go to angles `[8]`."""
+        """Makes one physics step with desired motor angles `[8]`, rad."""
         angle, rate = self._joints(self.motors) * DIRECTION
         given, self.torque = motor_torques(command, angle, rate)
         hotter = np.where(np.abs(given) > HOT, self.heat + 1, 0)
@@ -308,7 +308,7 @@ class Simulation:
         )
 
     def close(self) -> None:
-        """Ends the simulation and frees what it holds; so does letting go of it."""
+        """Disconnects from Bullet and frees its memory; garbage collection does the same."""
         self._end()
 
 
@@ -316,19 +316,19 @@ class Simulation:
 
 
 def serve(solver: Solver, patience: float) -> None:
-    """Steps robots that come on stdin until nobody is left to send any.
+    """Answers requests from stdin on stdout until stdin closes or the parent process ends.
 
-    First the settled start goes out, a row `[61]`. Then each request is an int32 n and n rows
-    of state and action `[69]`, and its answer n rows of the state after a control step; all
-    float32.
+    First it sends the settled initial state, a row `[61]`. A request is an int32 n and n rows
+    `[69]` of state and action; its answer is n rows `[61]`, the states after a control step. All
+    rows are float32.
 
     Args:
       solver: settings of Bullet.
-      patience: seconds for a request; the kernel ends a worker that takes longer.
+      patience: seconds for a request; a timer kills a worker that takes longer.
     """
     source, sink = os.dup(0), os.dup(1)
-    os.dup2(2, 1)  # what Bullet may have to say
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who sends
+    os.dup2(2, 1)  # keeps messages of Bullet out of the answers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     simulation, parent = Simulation(solver), os.getppid()
     send(sink, simulation.read())
@@ -347,7 +347,7 @@ def stepped(simulation: Simulation, row: np.ndarray) -> np.ndarray:
     simulation.step(row[WIDTH:].astype(np.float64))
     after = simulation.read()
     if not (np.abs(after) < ABSURD).all():
-        # Bullet does not get over it by itself: it would go on among its contacts.
+        # Else invalid numbers would stay in Bullet's contacts and spoil later steps.
         simulation.reset()
     return after
 
@@ -360,13 +360,13 @@ def send(sink: int, rows: np.ndarray) -> None:
 
 
 def receive(source: int, count: int, kind: Any, parent: int) -> np.ndarray | None:
-    """Reads `count` numbers; None once the other end is closed, or the parent is gone."""
+    """Reads `count` numbers; None if the pipe is closed or the parent process has ended."""
     size, data = count * np.dtype(kind).itemsize, b""
     ready = select.poll()
     ready.register(source, select.POLLIN)
     while len(data) < size:
         if not ready.poll(1000):
-            # A process that the parent forked may hold the pipe open after its death.
+            # After the parent's death, a process that it forked may keep the pipe open.
             if os.getppid() != parent:
                 return None
             continue

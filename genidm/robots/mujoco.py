@@ -1,4 +1,4 @@
-"""What robots with a MuJoCo model share: resets, states, and the mirror image of a model."""
+"""Base class of robots with a MuJoCo model: resets, states, and the mirror image of a model."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ ASSETS = epath.Path(brax.__file__).parent / "envs" / "assets"
 
 @dataclasses.dataclass(frozen=True)
 class Solver:
-    """Constraint solver settings, chosen for stability first (docs/physics.md).
+    """Settings of the constraint solver, chosen mainly for stability (docs/physics.md).
 
     Attributes:
-      iterations: Newton iterations a physics step. Brax's 1 is not stable.
-      line_search: line-search iterations a Newton iteration. Brax's 4 is not stable.
-      elliptic: true friction cones. The pyramid follows the world's axes, so it breaks
+      iterations: Newton iterations per physics step. Brax's value, 1, is not stable.
+      line_search: line-search iterations per Newton iteration. Brax's value, 4, is not stable.
+      elliptic: elliptic friction cones. Pyramidal cones depend on the world's axes, so they break
         equivalence modulo orientation (Def. 3).
     """
 
@@ -40,7 +40,7 @@ class Solver:
 
 
 def load(path: PathLike[str] | str, solver: Solver) -> mujoco.MjSpec:
-    """A model file (MJCF) with the solver settings put in."""
+    """Reads a model file (MJCF) and applies the solver settings."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = solver.iterations
@@ -52,14 +52,14 @@ def load(path: PathLike[str] | str, solver: Solver) -> mujoco.MjSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
-    """The reflection y → −y of a model, read off its geometry.
+    """The reflection y → −y of a model, as permutations and signs.
 
     Attributes:
-      bodies: `[nbody]`, for each body the one at its mirror image.
-      hinges: `[nv − 6]`, for each hinge the one at its mirror image.
-      signs: `[nv − 6]`, the sign that angle and torque take on.
-      actuators: `[nu]`, for each actuator the one at its mirror image.
-      actuator_signs: `[nu]`.
+      bodies: `[nbody]`, for each body the body at its mirror image.
+      hinges: `[nv − 6]`, for each hinge the hinge at its mirror image.
+      signs: `[nv − 6]`, −1 for hinges whose angle and torque change sign, else 1.
+      actuators: `[nu]`, for each actuator the actuator at its mirror image.
+      actuator_signs: `[nu]`, −1 for actuators whose torque changes sign, else 1.
     """
 
     bodies: list[int]
@@ -88,7 +88,7 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
     bodies = [_partner(data.xipos, i) for i in range(model.nbody)]
     hinges, signs = [], []
     for j in range(1, model.njnt):
-        # As a pseudovector, a hinge's axis keeps its y and turns its x and z.
+        # A hinge's axis is a pseudovector: the reflection negates its x and z, and keeps its y.
         axis = data.xaxis[j] * [-1, 1, -1]
         body = bodies[model.jnt_bodyid[j]]
         along = [
@@ -103,27 +103,28 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
 
 
 class MujocoRobot(Robot):
-    """A robot with a free base on hinges, stepped by an engine of `genidm.engines.ENGINES`.
+    """A robot with a free base and hinges, stepped by an engine of `genidm.engines.ENGINES`.
 
-    A subclass sets `name`, `model`, `frame_skip`, `dt`, `standing_height` and
-    `healthy_height`; docs/extending.md shows one. It overrides the rest where it differs.
+    A subclass sets `name`, `model`, `frame_skip`, `dt`, `standing_height` and `healthy_height`;
+    docs/extending.md shows one. It may override the other attributes and methods.
 
     By default s is gymnasium's without x and y: height, quaternion (w ≥ 0), joint angles,
     velocity, spin, joint velocities.
 
     Args:
-      solver: of the contacts.
-      engine: one of `engines`; chosen by what jax runs on, unless given.
+      solver: settings of the constraint solver.
+      engine: one of `engines`; default: chosen by hardware.
 
     Attributes:
       model: the MJCF file.
-      frame_skip: physics steps a control step.
+      frame_skip: physics steps per control step.
       healthy_height: metres, least and greatest height of the base; outside, the robot has fallen.
-      control_cost: cost of a step, times the sum of the squared actions.
-      reset_noise: of a start: ± m, ± rad; m/s, rad/s (standard deviation).
+      control_cost: weight of the sum of squared actions in the cost of a step.
+      reset_noise: noise of the initial state: half width of the uniform noise in qpos (m, rad),
+        standard deviation of the noise in qvel (m/s, rad/s).
 
     Raises:
-      ValueError: the model has no free base, has joints that are no hinges, is not its own mirror
+      ValueError: the model has no free base, has joints other than hinges, is not its own mirror
         image, or its time step does not fit `dt`.
     """
 
@@ -156,15 +157,15 @@ class MujocoRobot(Robot):
         )
 
     def _specify(self, solver: Solver) -> mujoco.MjSpec:
-        """The model with the solver settings."""
+        """The model, with the solver settings."""
         return load(self.model, solver)
 
     def rest_pose(self) -> np.ndarray:
-        """qpos `[nq]` that resets are drawn around."""
+        """qpos `[nq]` of the rest pose, the centre of the reset noise."""
         return self.mj_model.qpos0.astype(np.float32)
 
     def _layout(self) -> Layout:
-        """Layout of s, which `_observe` fills."""
+        """Layout of s, as `_observe` returns it."""
         m = self.mirror
         return Layout(
             (
@@ -196,13 +197,13 @@ class MujocoRobot(Robot):
         return self.set_state(physics, yaw)
 
     def _draw(self, key: jax.Array) -> Physics:
-        """gymnasium's start: the rest pose, uniform noise in qpos, Gaussian in qvel."""
+        """gymnasium's initial state: the rest pose, uniform noise in qpos, Gaussian in qvel."""
         pose, motion = jax.random.split(key)
         noise, nq, nv = self.reset_noise, self.mj_model.nq, self.mj_model.nv
         qpos = jnp.asarray(self._rest) + jax.random.uniform(
             pose, (nq,), jnp.float32, minval=-noise, maxval=noise
         )
-        # MuJoCo reads a quaternion of any length; the observation needs a unit one.
+        # MuJoCo normalises quaternions that it reads; the observation needs unit length, too.
         qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
         qvel = noise * jax.random.normal(motion, (nv,), jnp.float32)
         return Physics(qpos, qvel, jnp.zeros(nv, jnp.float32))
@@ -210,7 +211,7 @@ class MujocoRobot(Robot):
     def set_state(self, physics: Physics, yaw: jax.Array) -> State:
         contact = jnp.zeros((*yaw.shape, self.mj_model.nbody, 6), physics.qpos.dtype)
         state = jax.vmap(self._state)(self.rotate_physics(physics, yaw), contact)
-        # A start is not judged: noise may lift a robot out of its healthy height.
+        # An initial state is never a fall, although the noise may exceed the healthy height.
         return state.replace(fallen=jnp.zeros_like(state.fallen))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -247,10 +248,10 @@ class MujocoRobot(Robot):
 
 
 def _fitting(model: mujoco.MjModel, frame_skip: int, dt: float) -> None:
-    """Refuses a model that `Physics` does not describe, or that is stepped at another rate."""
+    """Checks that `Physics` describes the model, and that its time step fits `dt` (ValueError)."""
     free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
     if [*model.jnt_type[:1]] != [free] or not (model.jnt_type[1:] == hinge).all():
-        raise ValueError("the model is to have a free joint first, and hinges after it")
-    made = frame_skip * model.opt.timestep
-    if not math.isclose(made, dt, rel_tol=1e-6):
-        raise ValueError(f"{frame_skip} time steps of the model are {made:g} s, not {dt:g} s")
+        raise ValueError("the model must have a free joint first, and hinges after it")
+    seconds = frame_skip * model.opt.timestep
+    if not math.isclose(seconds, dt, rel_tol=1e-6):
+        raise ValueError(f"{frame_skip} time steps of the model are {seconds:g} s, not {dt:g} s")

@@ -1,4 +1,4 @@
-"""Videos of a robot at work: gif, mp4, and a page that can be turned and played.
+"""Videos of a controlled robot: gif, mp4, and an interactive page.
 
 video = render_run("runs/ant/LR-0-…")
 page(video)                       # in a notebook: shows itself
@@ -28,7 +28,7 @@ from genidm.video.encoding import FASTEST, encoder, gif, mp4
 from genidm.video.pages import Page, page
 from genidm.video.rendering import RenderSettings, frames
 
-# An mp4 has room for what would make a gif large; a page is not settings.
+# An mp4 stays small at sizes at which a gif is large. A page ignores these settings.
 SETTINGS = {
     ".gif": RenderSettings(),
     ".mp4": RenderSettings(width=640, height=480, fps=25.0),
@@ -37,19 +37,21 @@ SETTINGS = {
 
 
 def check(path: Path | str, **changes: Any) -> RenderSettings:
-    """How a video that is written to `path` is shot; to be asked before the video is made.
+    """Checks that a video can be written to `path`; returns the settings of its rendering.
+
+    Call it before the video is computed, so that errors are found early.
 
     Args:
       path: .gif, .mp4 or .html.
-      changes: to the `RenderSettings` of this kind of file: width, height, fps, hold, caption.
+      changes: to the `RenderSettings` of this file type: width, height, fps, hold, caption.
 
     Raises:
-      BadInput: there is no such kind, a change is out of range, the file cannot be written, or
-        there is nothing to draw or encode with.
+      BadInput: the file type is unknown, a change is out of range, the file cannot be written, or
+        a renderer or an encoder is missing.
     """
     kind = Path(path).suffix
     if kind not in SETTINGS:
-        raise BadInput(f"a video is a .gif, an .mp4 or a page (.html), not {Path(path).name}")
+        raise BadInput(f"a video must be a .gif, .mp4 or .html file, not {Path(path).name}")
     settings = dataclasses.replace(SETTINGS[kind], **changes)
     check_writable(path)
     if kind == ".gif":
@@ -62,16 +64,16 @@ def check(path: Path | str, **changes: Any) -> RenderSettings:
 
 
 def write(made: Video, path: Path | str, quiet: bool = False, **changes: Any) -> None:
-    """Writes a video, as its name's ending says.
+    """Writes a video to a file; the suffix of its name chooses the format.
 
     Args:
       made: the video.
       path: .gif, .mp4 or .html.
       quiet: no progress bar.
-      changes: as to `check`.
+      changes: as for `check`.
 
     Raises:
-      BadInput: as `check` does, or the disk is full.
+      BadInput: as for `check`, or the disk is full.
     """
     settings, kind = check(path, **changes), Path(path).suffix
     if kind == ".html":

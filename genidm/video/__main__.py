@@ -30,31 +30,31 @@ def main(
     """Renders a controller in episodes of the test (A.1.3), or on its way through waypoints.
 
     Args:
-      runs: one directory of a fit or a baseline (METHOD-SEED-…), as a cell leaves it under
-        --run-dir.
-      out: files to write: .gif, .mp4 (needs the extra `video`), or .html, a page that can be
-        turned and played and needs no renderer; runs/video/ROBOT-RUN.gif, unless given.
-      episodes: numbers of the test's episodes, from 0 on, or of the starts of journeys through
-        waypoints; 0 1 2 of the test, and one journey, unless given.
-      waypoints: x and y of each, metres; starts are near the origin. Without any, the test's
-        targets.
+      runs: one directory of a fit or a baseline (METHOD-SEED-…) under --run-dir.
+      out: files to write: .gif, .mp4 (needs the extra `video`), or .html, an interactive page that
+        needs no renderer; default: runs/video/ROBOT-RUN.gif.
+      episodes: numbers of episodes, from 0; default: 0 1 2 of the test, or 0 with waypoints.
+      waypoints: x and y of each, metres; robots start near the origin. Default: the targets of
+        the test.
       goal_radius: metres; a waypoint is reached when the robot is this near. The test has its own.
-      seed: of the test, or of the starts.
-      seconds: an episode that is longer ends here.
-      width: pixels of a picture; 320 in a gif, 640 in an mp4, unless given.
-      height: pixels; 240 and 480, unless given.
-      fps: pictures a second, at most 50 in a gif; 12.5 and 25, unless given.
-      engine: "mjx" or "mujoco"; that of the run, unless given.
+      seed: of the test, or of the initial states.
+      seconds: longest duration of an episode.
+      width: pixels of a frame; default: 320 in a gif, 640 in an mp4.
+      height: pixels of a frame; default: 240 in a gif, 480 in an mp4.
+      fps: frames per second, at most 50 in a gif; default: 12.5 in a gif, 25 in an mp4.
+      engine: "mjx" or "mujoco"; default: the run's engine.
 
     Raises:
-      BadInput: there is no such file, controller or visual model, or nothing to draw with.
+      BadInput: no such controller or episode; the robot has no visual model; a renderer or an
+        encoder is missing; or a file cannot be written.
     """
     if len(runs) != 1:
-        raise BadInput(f"a video is of one run, not of {', '.join(map(str, runs)) or 'none'}")
+        given = ", ".join(map(str, runs)) or "none"
+        raise BadInput(f"a video needs exactly one run, got {given}")
     (run,) = runs
     paths = out or (Path("runs/video") / f"{run.resolve().parent.name}-{run.resolve().name}.gif",)
-    given = {"width": width, "height": height, "fps": fps}
-    changes: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
+    settings = {"width": width, "height": height, "fps": fps}
+    changes: dict[str, Any] = {name: x for name, x in settings.items() if x is not None}
     for path in paths:
         video.check(path, **changes)
     points = in_twos(waypoints) if waypoints else None

@@ -1,7 +1,7 @@
-"""What MuJoCo draws with: EGL on a GPU, OSMesa in software, as the machine has it.
+"""Chooses MuJoCo's rendering backend: EGL (GPU) or OSMesa (software), as available.
 
-PyOpenGL binds itself to one of them for the life of a process, so each is tried in a process
-of its own, and only the one that starts is imported here.
+PyOpenGL cannot change its backend within a process. So each backend is tried in a separate
+process, and this process imports only one that works.
 """
 
 from __future__ import annotations
@@ -18,48 +18,54 @@ from mujoco.rendering.classic import gl_context
 
 from genidm.errors import BadInput
 
-# Windows' and macOS' own, and what the user may name in MUJOCO_GL.
+# Backends of Windows and macOS; values of MUJOCO_GL; values that disable rendering; GPU devices.
 OWN = {"win32": "glfw", "darwin": "cgl"}
 NAMED = ("egl", "osmesa", "glfw", "cgl")
 OFF = ("disable", "disabled", "off", "false", "0")
 GPU = ("nvidia[0-9]*", "dri/renderD*")
 
 _TRIAL = "import mujoco; mujoco.Renderer(mujoco.MjSpec().compile(), 8, 8).close()"
-# A machine that is busy compiles Mesa's shaders for a while.
+# Seconds for a trial: a busy machine needs long to compile Mesa's shaders.
 PATIENCE = 120.0
 
 
 def renderer(model: mujoco.MjModel, width: int, height: int, most: int) -> mujoco.Renderer:
-    """MuJoCo's renderer, a context manager, for pictures of a size and so many things in them.
+    """MuJoCo's renderer, a context manager.
+
+    Args:
+      model: the model to render.
+      width: pixels.
+      height: pixels.
+      most: largest number of geoms in a frame.
 
     Raises:
-      BadInput: there is nothing to draw with.
+      BadInput: no backend works.
     """
-    # MuJoCo chooses when it is imported, by MUJOCO_GL alone, and by none takes a window's.
+    # At its import MuJoCo chooses by MUJOCO_GL alone; without it, it needs a window system.
     gl_context.GLContext = importlib.import_module(f"mujoco.{backend()}").GLContext
     return mujoco.Renderer(model, height, width, most)
 
 
 @functools.cache
 def backend() -> str:
-    """The backend that starts: the user's `MUJOCO_GL`; else EGL or OSMesa.
+    """Finds the rendering backend that works: the user's `MUJOCO_GL`, else EGL or OSMesa.
 
     Raises:
-      BadInput: none does.
+      BadInput: no backend works.
     """
     tried = candidates()
     for name in tried:
         if starts(name):
             return name
-    what = f"neither {' nor '.join(tried)} starts" if tried else "MUJOCO_GL turns it off"
+    why = f"{' and '.join(tried)} failed" if tried else "MUJOCO_GL turns it off"
     raise BadInput(
-        f"no picture can be drawn here: {what}. In software: apt-get install libosmesa6; with a "
-        "GPU's driver: apt-get install libegl1. The interactive page (.html) needs none of it"
+        f"MuJoCo cannot render here: {why}. Install libosmesa6 (software) or libegl1 (with a GPU "
+        "driver), or write the interactive page (.html), which needs no renderer"
     )
 
 
 def candidates() -> tuple[str, ...]:
-    """What to try, in order."""
+    """Backends to try, in order."""
     given = os.environ.get("MUJOCO_GL", "").lower().strip()
     if given in NAMED:
         return (given,)
@@ -72,7 +78,7 @@ def candidates() -> tuple[str, ...]:
 
 
 def starts(name: str) -> bool:
-    """Whether a backend draws, in a process of its own."""
+    """Whether a backend renders a frame in a separate process."""
     command, chosen = [sys.executable, "-c", _TRIAL], {**os.environ, "MUJOCO_GL": name}
     try:
         trial = subprocess.run(command, env=chosen, capture_output=True, timeout=PATIENCE)

@@ -1,4 +1,4 @@
-"""A video: journeys of one robot, with the pose that it was in at every step."""
+"""Videos as data: clips of one robot, with its pose after every step."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from genidm.files import MANIFEST, Corrupt, load_arrays, load_json
 from genidm.robots import Robot, by_name, remade
 from genidm.store import Stage
 
-# Robots that walk at once, filled up with some of them again: a program is then compiled once
-# for films of however many, and float sums, which depend on that number, come out alike.
+# The batch is a multiple of LANES, filled with copies: videos of any number of clips then share
+# one compiled program, and equal float sums, whose order depends on the batch size.
 LANES = 16
-# By their numbers in a test seed.
+# Default episodes, by their numbers in a test seed.
 EPISODES = (0, 1, 2)
 MOST_EPISODES = 10**6  # of a test seed
-# Seconds; who has not arrived by then goes round and round.
+# Seconds; a robot that has not arrived by then mostly walks in circles.
 LONGEST = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """One journey, up to its end: t states, the start among them.
+    """One episode as it is shown: t states, with the initial state.
 
     Attributes:
       qpos: `[t, nq]`, of the visual model.
       position: `[t, 3]`, of the base, metres.
       waypoints: `[W, 3]`, metres.
-      arrival: `[W]`, step at which a waypoint was reached; −1 where it was not.
-      fell: whether it ended in a fall, or in physics that diverged.
-      dt: seconds from one state to the next.
+      arrival: `[W]`, step at which a waypoint was reached; −1 if it was not reached.
+      fell: whether the episode ended in a fall, or with physics that diverged.
+      dt: seconds between two states.
     """
 
     qpos: np.ndarray
@@ -56,40 +56,40 @@ class Clip:
 
     @property
     def times(self) -> np.ndarray:
-        """Seconds since the start `[t]`."""
+        """Seconds since the start, of every state `[t]`."""
         return self.dt * np.arange(len(self.qpos))
 
     @property
     def seconds(self) -> float:
-        """How long it took."""
+        """Duration in seconds."""
         return float(self.times[-1])
 
     @property
     def arrivals(self) -> np.ndarray:
-        """Seconds to each waypoint `[W]`; infinite where it was not reached."""
+        """Seconds until each waypoint was reached `[W]`; infinite if it was not reached."""
         return np.where(self.arrival < 0, np.inf, self.dt * self.arrival)
 
     def left(self, seconds: np.ndarray) -> np.ndarray:
-        """Which waypoints are left at some times `[n]`: `[n, W]` bool."""
+        """Whether each waypoint is not yet reached, at times `[n]`: `[n, W]` bool."""
         return self.arrivals > seconds[:, None] + 1e-6
 
     def goal(self, seconds: np.ndarray) -> np.ndarray:
-        """The waypoint that it is on its way to at some times `[n]`: `[n, 3]`, metres."""
+        """The waypoint that the robot is going to, at times `[n]`: `[n, 3]`, metres."""
         reached = (~self.left(seconds)).sum(-1)
         return self.waypoints[np.minimum(reached, len(self.waypoints) - 1)]
 
     def place(self, seconds: np.ndarray) -> np.ndarray:
-        """Where the base is at some times `[n]`: `[n, 3]`, metres."""
+        """Position of the base at times `[n]`: `[n, 3]`, metres."""
         return between(self.position, self.times, seconds)
 
     def at(self, model: mujoco.MjModel, seconds: np.ndarray) -> np.ndarray:
-        """Poses `[n, nq]` at some times `[n]`, between the steps on the straight way."""
+        """Poses `[n, nq]` at times `[n]`, interpolated between the states."""
         before = np.clip(seconds // self.dt, 0, len(self.qpos) - 2).astype(int)
-        share = seconds / self.dt - before
-        way, poses = np.zeros(model.nv), self.qpos[before].astype(float)
-        for pose, after, part in zip(poses, self.qpos[before + 1], share, strict=True):
-            mujoco.mj_differentiatePos(model, way, 1.0, pose, after.astype(float))
-            mujoco.mj_integratePos(model, pose, way, part)
+        fractions = seconds / self.dt - before
+        change, poses = np.zeros(model.nv), self.qpos[before].astype(float)
+        for pose, after, fraction in zip(poses, self.qpos[before + 1], fractions, strict=True):
+            mujoco.mj_differentiatePos(model, change, 1.0, pose, after.astype(float))
+            mujoco.mj_integratePos(model, pose, change, fraction)
         return poses
 
 
@@ -98,9 +98,9 @@ class Video:
     """Clips of one robot.
 
     Attributes:
-      title: what the video is of.
-      visual_model: what the robot looks like.
-      clips: its journeys.
+      title: text in the caption.
+      visual_model: the robot's appearance.
+      clips: its episodes.
       goal_radius: metres; a waypoint is reached when the robot is this near.
     """
 
@@ -111,7 +111,7 @@ class Video:
 
 
 def between(x: np.ndarray, times: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """`x [t, n]`, known at some times `[t]`, at others `[m]`: `[m, n]`, on straight lines."""
+    """Interpolates `x [t, n]` at `times [t]` linearly to the times `seconds [m]`: `[m, n]`."""
     return np.stack([np.interp(seconds, times, column) for column in x.T], axis=-1)
 
 
@@ -126,20 +126,20 @@ def render(
     *,
     quiet: bool = False,
 ) -> Video:
-    """Leads robots through waypoints, and keeps every pose.
+    """Runs a controller through waypoints and records every pose.
 
     Args:
-      robot: what walks.
+      robot: the robot.
       controller: its controller.
-      waypoints: `[W, 2]` or `[W, 3]`, metres, or for each robot its own, `[B, W, 2]`.
-      keys: `[B]`, of the starts.
-      yaw: `[B]`, radians, that the starts are turned by.
-      settings: length of a journey, goal radius.
-      title: what the video is of; the robot's name, unless given.
+      waypoints: `[W, 2]` or `[W, 3]`, metres; or `[B, W, 2]`, different for each robot.
+      keys: `[B]`, of the initial states.
+      yaw: `[B]`, radians by which the initial states are rotated.
+      settings: length of an episode, goal radius.
+      title: text in the caption; default: the robot's name.
       quiet: no progress bar.
 
     Raises:
-      BadInput: the robot has no visual model, or the waypoints are none.
+      BadInput: the robot has no visual model, or the waypoints are invalid.
     """
     settings, visual_model = settings or WaypointSettings(), robot.visual_model()
     fill = np.arange(-(-len(keys) // LANES) * LANES) % len(keys)
@@ -162,24 +162,24 @@ def render_test(
     *,
     quiet: bool = False,
 ) -> Video:
-    """Episodes of the test (A.1.3), from the same starts to the same targets.
+    """Runs episodes of the test (A.1.3) again: the same initial states, the same targets.
 
-    It walks anew. Float sums depend on how many robots walk at once, and walking is chaotic:
-    after some seconds a video may go another way than the test went (see `render_recorded`).
+    The result may differ from the test's after some seconds, because float sums depend on the
+    batch size and walking is chaotic. `render_recorded` shows what the test has recorded.
 
     Args:
-      robot: what walks.
+      robot: the robot.
       controller: its controller.
-      episodes: their numbers in the test seed, from 0 on.
-      seed: of the test.
-      seconds: a longer episode ends here.
-      title: what the video is of; the robot's name, unless given.
+      episodes: their numbers in the test seed, from 0.
+      seed: the test seed.
+      seconds: longest duration of an episode.
+      title: text in the caption; default: the robot's name.
       quiet: no progress bar.
 
     Raises:
-      BadInput: the robot has no visual model, or there is no such episode.
+      BadInput: the robot has no visual model, or an episode's number is out of range.
     """
-    robot.visual_model()  # before anything is computed
+    robot.visual_model()  # raises its error before anything is computed
     test_scenarios, test = (
         scenarios(robot, 1, count_to(episodes, seed), first_seed=seed),
         EvaluationSettings(),
@@ -199,25 +199,25 @@ def render_recorded(
     seconds: float = LONGEST,
     title: str = "",
 ) -> Video:
-    """Episodes of a test as they went: the recordings that the test has kept.
+    """Shows episodes that a test has recorded, exactly as they were.
 
     Args:
-      robot: what walked.
+      robot: the robot of the test.
       test: the directory of a finished test (test-METHOD-SEED-…).
-      episodes: their numbers in its first seed; all that it has recorded, unless given.
-      seconds: a longer episode is cut here.
-      title: what the video is of; the robot's name, unless given.
+      episodes: their numbers in its first seed; default: all recorded episodes.
+      seconds: longest duration of an episode.
+      title: text in the caption; default: the robot's name.
 
     Raises:
       BadInput: the robot has no visual model, or the test has not recorded the episodes.
     """
-    visual_model, settings = robot.visual_model(), _said(test, "test")
+    visual_model, settings = robot.visual_model(), _summary_value(test, "test")
     tree, _ = load_arrays(Path(test) / "episodes")
     recordings, outcome = tree.get("recordings", {}), tree["episodes"]
     most, clips = steps(robot, seconds, settings["max_steps"]), list[Clip]()
     for i in episodes or sorted(map(int, recordings)) or EPISODES:
         if str(i) not in recordings:
-            raise BadInput(f"{test} has no recording of episode {i}")
+            raise BadInput(f"{test} has not recorded episode {i}")
         made = recordings[str(i)]
         last = len(made["qpos"]) - 1
         reached, fell = (bool(outcome[name][0, i]) and last <= most for name in ("reached", "fell"))
@@ -244,25 +244,26 @@ def render_run(
     engine: str | None = None,
     robot: Robot | None = None,
 ) -> Video:
-    """Renders the controller that lies in a run's directory (METHOD-SEED-…).
+    """Renders the controller of a run's directory (METHOD-SEED-…).
 
     Args:
-      run: the directory of a fit or a baseline, as cells leave it under --run-dir.
-      episodes: numbers of the test's episodes, or of the starts; `EPISODES` and 0, unless given.
-      waypoints: `[W, 2]`, metres, to lead it through; None: the targets of the test, and where
-        one of the run's tests has recorded the episodes, as they went.
-      seed: of the test, or of the starts.
-      seconds: a longer journey ends here.
+      run: the directory of a fit or a baseline under --run-dir.
+      episodes: numbers of episodes, from 0; default: `EPISODES`, or 0 with waypoints.
+      waypoints: `[W, 2]`, metres. None: the targets of the test; if a test of the run has
+        recorded the episodes, the recording is shown.
+      seed: of the test, or of the initial states.
+      seconds: longest duration of an episode.
       goal_radius: metres; a given waypoint is reached when it is this near (the test has its own).
-      engine: that steps the robot; the run's own, unless given.
-      robot: what walks; as the run's config has it, unless given.
+      engine: name of the engine that steps the robot; default: the run's engine.
+      robot: the robot; default: the robot of the run's config.
 
     Raises:
-      BadInput: no controller lies there, its robot has no visual model, or a number cannot be.
+      BadInput: the directory has no controller, its robot has no visual model, or a number is out
+        of range.
     """
     starts = episodes or (EPISODES if waypoints is None else (0,))
     highest, robot = count_to(starts, seed), robot or robot_of(run, engine)
-    title = f"{_said(run, 'method')}, {robot.name}"
+    title = f"{_summary_value(run, 'method')}, {robot.name}"
     if waypoints is None:
         test = recorded(run, robot, episodes) if seed == 0 else None
         if test:
@@ -276,22 +277,25 @@ def render_run(
 
 
 def recorded(run: Path | str, robot: Robot, episodes: Sequence[int] = ()) -> Path | None:
-    """The newest test of a run, on the robot's engine, that has recorded some episodes.
+    """Finds the newest test of a run, on the robot's engine, that has recorded the episodes.
 
     Args:
       run: the directory of a fit or a baseline.
-      robot: what walks.
-      episodes: those that it must have recorded; any, unless given.
+      robot: the robot.
+      episodes: the episodes that it must have recorded; default: any.
+
+    Returns:
+      the directory of the test, or None.
     """
     run = Path(run).resolve()
     done = sorted(run.parent.glob("test-*/done.json"), key=lambda p: p.stat().st_mtime)
     for test in (path.parent for path in reversed(done)):
         try:
-            of = _said(test, "fit"), _said(test, "engine")
+            of = _summary_value(test, "fit"), _summary_value(test, "engine")
         except BadInput:
-            continue  # somebody else's: no reason to have no video at all
+            continue  # an invalid test of another run must not prevent the video
         if of == (run.name, robot.engine_name):
-            # By its files' names: who reads them sees whether they are whole.
+            # File names suffice here: `load_arrays` finds corrupt files when it reads them.
             names = [name.split(".") for name in load_json(test / "episodes" / MANIFEST)]
             kept = {name[1] for name in names if name[0] == "recordings"}
             if kept and kept.issuperset(map(str, episodes)):
@@ -300,40 +304,44 @@ def recorded(run: Path | str, robot: Robot, episodes: Sequence[int] = ()) -> Pat
 
 
 def count_to(episodes: Sequence[int], seed: int = 0) -> int:
-    """How many there must be, so that there are episodes of these numbers.
+    """The number of episodes to draw, so that all of `episodes` are among them.
 
     Raises:
-      BadInput: there is no such episode, none is named, or there is no such seed.
+      BadInput: a number or the seed is out of range, or `episodes` is empty.
     """
     check_value("the seed of a video", seed, count(0, 2**32 - 1))
     if not episodes:
-        raise BadInput("a video is of at least one episode")
+        raise BadInput("a video needs at least one episode")
     for i in episodes:
         check_value("the number of an episode", i, count(0, MOST_EPISODES - 1))
     return max(episodes) + 1
 
 
 def steps(robot: Robot, seconds: float, most: int) -> int:
-    """Control steps in so many seconds, at most `most`.
+    """Control steps in `seconds`, at most `most`.
 
     Raises:
-      BadInput: not a step fits into them.
+      BadInput: `seconds` is shorter than one step.
     """
     if not seconds >= robot.dt:
-        raise BadInput(f"a video of the {robot.name} takes at least {robot.dt} s")
+        raise BadInput(f"a video of the {robot.name} must last at least {robot.dt} s")
     return int(min(seconds / robot.dt, most))
 
 
 def robot_of(run: Path | str, engine: str | None = None) -> Robot:
-    """The robot that a run's controller was made for, with the settings it had.
+    """Makes the robot of a run's controller, with the settings of the run.
 
-    A fit's config leaves them to the experience beside it; where that is gone, the robot is
-    taken as it comes. `engine` takes the place of the run's own.
+    The settings are in the run's config, or for a fit in the config of its experience. If that is
+    missing, the robot has its default settings.
+
+    Args:
+      run: the directory of a fit or a baseline.
+      engine: name of the engine; default: the run's engine.
 
     Raises:
-      BadInput: it is not the directory of a finished run, or no robot can be made so.
+      BadInput: it is not the directory of a finished run, or the robot rejects the settings.
     """
-    run, name = Path(run), _said(run, "robot")
+    run, name = Path(run), _summary_value(run, "robot")
     experience = Stage(run).summary().get("experience")
     for stage in (run, run.parent / experience) if experience else (run,):
         try:
@@ -345,11 +353,11 @@ def robot_of(run: Path | str, engine: str | None = None) -> Robot:
     return by_name(name, engine)
 
 
-def _said(directory: Path | str, name: str) -> Any:
-    """What the summary of a finished stage says; BadInput where it does not say it."""
+def _summary_value(directory: Path | str, name: str) -> Any:
+    """A value of a finished stage's summary; BadInput if it is missing."""
     summary = Stage(Path(directory)).summary()
     if not isinstance(summary, dict) or name not in summary:
-        raise BadInput(f"{directory} cannot be filmed: its done.json names no {name}")
+        raise BadInput(f"{directory} cannot be rendered: its done.json has no {name!r}")
     return summary[name]
 
 

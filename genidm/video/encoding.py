@@ -1,4 +1,4 @@
-"""Videos as files: gif by Pillow, mp4 by the ffmpeg that comes with imageio-ffmpeg."""
+"""Encodes frames: gif with Pillow, mp4 with the ffmpeg of imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from PIL import Image
 
 from genidm.errors import BadInput
 
-FASTEST = 50.0  # pictures a second of a gif: browsers slow down what is shown for less than 0.02 s
-# Of all pictures together: few colours, and the same ones, are what keeps a gif small.
+FASTEST = 50.0  # frames per second of a gif; browsers slow down frames shorter than 0.02 s
+# One palette for all frames, with few colours, keeps a gif small.
 COLOURS = 64
-SAMPLED = 24
+SAMPLED = 24  # frames from which the palette is computed
 RAW = "-v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -"
-# Players take whole pairs of pixels alone.
+# Players need an even width and height.
 H264 = "-c:v h264 -crf 25 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
 
 
 def gif(pictures: Iterable[np.ndarray], fps: float) -> bytes:
-    """Pictures `[height, width, 3]` as a gif that plays again and again.
+    """Encodes frames as a gif that repeats.
 
     Args:
-      pictures: uint8.
-      fps: pictures a second; a gif's times are whole hundredths of a second.
+      pictures: `[height, width, 3]` each, uint8.
+      fps: frames per second; a gif rounds the time per frame to hundredths of a second.
     """
     pictures = list(pictures)
     palette = _palette(pictures)
@@ -45,21 +45,21 @@ def gif(pictures: Iterable[np.ndarray], fps: float) -> bytes:
 
 
 def _palette(pictures: Sequence[np.ndarray]) -> Image.Image:
-    """The colours that some of the pictures are made of."""
-    shown = pictures[:: -(-len(pictures) // SAMPLED)]
-    # Not by median cut, which leaves no colour for what is as small as a target.
-    return Image.fromarray(np.concatenate(shown)).quantize(COLOURS, Image.Quantize.FASTOCTREE)
+    """An image with the palette of a sample of the frames."""
+    sample = pictures[:: -(-len(pictures) // SAMPLED)]
+    # Median cut would leave no colour for objects as small as a target.
+    return Image.fromarray(np.concatenate(sample)).quantize(COLOURS, Image.Quantize.FASTOCTREE)
 
 
 def mp4(pictures: Iterable[np.ndarray], fps: float) -> bytes:
-    """Pictures `[height, width, 3]` as H.264 in an mp4.
+    """Encodes frames as H.264 in an mp4.
 
     Args:
-      pictures: uint8; each is encoded as it comes.
-      fps: pictures a second.
+      pictures: `[height, width, 3]` each, uint8; at least one. They are not kept in memory.
+      fps: frames per second.
 
     Raises:
-      BadInput: there is no ffmpeg, or it cannot encode them.
+      BadInput: ffmpeg is missing or fails.
     """
     pictures = iter(pictures)
     first = next(pictures)
@@ -69,25 +69,25 @@ def mp4(pictures: Iterable[np.ndarray], fps: float) -> bytes:
         command = [encoder(), *raw.split(), *H264.split(), str(path)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
             assert ffmpeg.stdin
-            with contextlib.suppress(BrokenPipeError):  # it says why at its end
+            with contextlib.suppress(BrokenPipeError):  # stderr, read below, has the reason
                 for picture in itertools.chain([first], pictures):
                     ffmpeg.stdin.write(picture.tobytes())
-            said = " ".join(ffmpeg.communicate()[1].decode(errors="replace").split())
+            message = " ".join(ffmpeg.communicate()[1].decode(errors="replace").split())
         if ffmpeg.returncode:
-            why = said or f"exit status {ffmpeg.returncode}"
+            why = message or f"exit status {ffmpeg.returncode}"
             raise BadInput(f"ffmpeg cannot encode the mp4 in {folder}: {why}")
         return path.read_bytes()
 
 
 def encoder() -> str:
-    """The ffmpeg of imageio-ffmpeg, of the extra `video`.
+    """Path of the ffmpeg of imageio-ffmpeg (extra `video`).
 
     Raises:
-      BadInput: there is none.
+      BadInput: it is not installed.
     """
     try:
         return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
     except (ImportError, RuntimeError):
         raise BadInput(
-            'mp4 needs imageio-ffmpeg: pip install "genidm[video]"; .gif and .html do not'
+            'mp4 needs imageio-ffmpeg: pip install "genidm[video]" (.gif and .html do not need it)'
         ) from None

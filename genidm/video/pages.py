@@ -1,6 +1,6 @@
-"""A video as one page: what the robot is made of, its poses as numbers, and a viewer.
+"""A video as one HTML page: the robot's geoms, its poses as numbers, and a viewer.
 
-The page is whole: it asks nothing of a network, of a GPU, or of the machine that made it.
+The page is self-contained: it needs no network, no GPU, and no other file.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from genidm.video.clips import Clip, Video
 from genidm.video.scenery import size
 
 FPS = 20.0
-# What is shown in whole numbers: metres in thousandths, quaternions in ten thousandths.
+# Scales of the whole numbers in the page: metres in thousandths, quaternions in ten thousandths.
 PLACE, TURN = 1e3, 1e4
 HEIGHT = 460  # pixels, in a notebook
 
-KINDS = {"sphere", "capsule", "box", "cylinder", "ellipsoid"}  # of geoms that the viewer draws
+KINDS = {"sphere", "capsule", "box", "cylinder", "ellipsoid"}  # geom types that the viewer draws
 
 
 class Page(str):
-    """A page of HTML, which a notebook shows in a frame of its own."""
+    """An HTML page; a notebook shows it in an iframe."""
 
     def _repr_html_(self) -> str:
         return (
@@ -35,19 +35,19 @@ class Page(str):
 
 
 def page(video: Video) -> Page:
-    """The video as a page that can be turned, zoomed and played."""
+    """Makes an interactive HTML page of a video: rotate, zoom, play."""
     viewer = importlib.resources.files("genidm.video").joinpath("viewer.html").read_text("utf-8")
     data = json.dumps(contents(video), separators=(",", ":"), allow_nan=False)
-    # A script ends at the first "</script", wherever that stands.
+    # "</script" would end the script even inside a JSON string, so every "<" is escaped.
     return Page(viewer.replace("FILM", data.replace("<", "\\u003c"), 1))
 
 
 def contents(video: Video) -> dict[str, Any]:
-    """What the page is given.
+    """The data of the page, for viewer.html.
 
-    `fps` frames a second, `size` of the robot (m), `goal_radius` (m), the `geoms` that the robot is
-    made of, each in the frame of a body, and the `takes`. A clip's `frames` are rows of whole
-    numbers: the base's x, y, z (mm), then for each body x, y, z (mm) and quaternion (1e-4).
+    `fps` frames per second, `size` of the robot (m), the goal radius `reach` (m), the robot's
+    `geoms`, each in the frame of its body, and the clips `takes`. A clip's `frames` are rows of
+    whole numbers: the base's x, y, z (mm), then for each body x, y, z (mm) and quaternion (1e-4).
     """
     model, start = video.visual_model.compile(), video.clips[0].qpos[0]
     shown = _shown(model)
@@ -63,7 +63,7 @@ def contents(video: Video) -> dict[str, Any]:
 
 
 def _shown(model: mujoco.MjModel) -> dict[int, np.ndarray]:
-    """The geoms that MuJoCo draws, but for floors, and their colours `[4]` from 0 to 1."""
+    """The geoms that MuJoCo draws, without planes: id → colour `[4]`, 0 to 1."""
     data, scene = mujoco.MjData(model), mujoco.MjvScene(model, maxgeom=10_000)
     mujoco.mj_forward(model, data)
     mujoco.mjv_updateScene(
@@ -76,7 +76,7 @@ def _shown(model: mujoco.MjModel) -> dict[int, np.ndarray]:
 def _geom(
     model: mujoco.MjModel, geom: int, colour: np.ndarray, bodies: list[int]
 ) -> dict[str, Any]:
-    """One geom; a mesh, or what else the viewer does not know, as the box around it."""
+    """One geom; a type that the viewer cannot draw (a mesh) becomes its bounding box."""
     kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
     known = kind in KINDS
     place, turn = model.geom_pos[geom], model.geom_quat[geom]
@@ -114,9 +114,9 @@ def _clip(model: mujoco.MjModel, bodies: list[int], clip: Clip) -> dict[str, Any
 
 
 def outcome(clip: Clip) -> str:
-    """What became of a journey, in a few words."""
+    """The outcome of a clip in a few words, as the page shows it."""
     reached, count = int((clip.arrival >= 0).sum()), len(clip.arrival)
     if reached == count:
-        return f"there in {clip.seconds:.1f} s"
+        return f"arrived after {clip.seconds:.1f} s"
     way = f"{reached} of {count}, " if count > 1 else ""
     return f"{way}fell after {clip.seconds:.1f} s" if clip.fell else f"{way}{clip.seconds:.1f} s"

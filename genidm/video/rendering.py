@@ -1,4 +1,4 @@
-"""Pictures of a video, by MuJoCo's renderer."""
+"""Renders the frames of a video with MuJoCo."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from genidm.video.backends import renderer
 from genidm.video.clips import Clip, Video, between
 from genidm.video.scenery import REACHED, RGBA, SUN, SUN_AWAY, TO_GO, TRAIL, scene, size
 
-# The camera: metres away in sizes of the robot, degrees, seconds that its moves are smoothed over.
+# The camera: distance in robot sizes, elevation and azimuth in degrees (azimuth relative to the
+# way to the goal), and the widths in seconds over which position and azimuth are smoothed.
 AWAY = 3.7
 DOWN = -27.0
 ASIDE = 38.0
 CALM_PLACE = 0.25
 CALM_TURN = 0.7
-# A waypoint's flag: a ball that hovers over where the base should come, in sizes of the robot.
+# A waypoint's flag is a ball above the waypoint: radius and height, in robot sizes.
 BALL = 0.13
 HOVER = 0.65
-# Metres: radius of the trail and of a flag's pole, from one piece of the trail to the next.
+# Metres: radius of the trail (a flag's pole has half of it), length of a piece of the trail.
 LINE = 0.02
 PIECE = 0.08
 MOST_MARKS = 4000
@@ -34,13 +35,13 @@ MOST_MARKS = 4000
 
 @dataclasses.dataclass(frozen=True)
 class RenderSettings:
-    """How a video is rendered.
+    """Settings of the rendering.
 
     Attributes:
       width, height: pixels.
-      fps: pictures a second.
-      hold: seconds that the end of a journey is shown.
-      caption: write time and distance into the pictures.
+      fps: frames per second.
+      hold: seconds for which the last frame of a clip is shown.
+      caption: whether title, time and distance are written into the frames.
     """
 
     width: int = 320
@@ -55,15 +56,15 @@ class RenderSettings:
 
 
 def frames(video: Video, settings: RenderSettings, quiet: bool = False) -> Iterator[np.ndarray]:
-    """The pictures `[height, width, 3]` of every clip, one after another, as uint8.
+    """Renders all clips, one after another; yields frames `[height, width, 3]`, uint8.
 
     Raises:
-      BadInput: there is nothing to draw with.
+      BadInput: no rendering backend works.
     """
     model = scene(video.visual_model, settings.width, settings.height)
     cues = [times(clip, settings) for clip in video.clips]
     with (
-        Progress("pictures", sum(map(len, cues)), "pictures", quiet=quiet) as bar,
+        Progress("frames", sum(map(len, cues)), "frames", quiet=quiet) as bar,
         renderer(model, settings.width, settings.height, MOST_MARKS + model.ngeom) as eye,
     ):
         for number, (clip, seconds) in enumerate(zip(video.clips, cues, strict=True), 1):
@@ -74,7 +75,7 @@ def frames(video: Video, settings: RenderSettings, quiet: bool = False) -> Itera
 
 
 def times(clip: Clip, settings: RenderSettings) -> np.ndarray:
-    """Seconds since the start that are shown, the end for a while."""
+    """Seconds since the start of every frame `[n]`; the end repeats for `settings.hold` seconds."""
     moving = np.arange(0, clip.seconds, 1 / settings.fps)
     return np.append(moving, [clip.seconds] * (1 + round(settings.hold * settings.fps)))
 
@@ -87,12 +88,12 @@ def mark(
     goal_radius: float,
     size: float,
 ) -> None:
-    """Adds what stands beside the robot: its waypoints, and its way so far.
+    """Adds the waypoints and the robot's trail to a scene.
 
     Args:
-      scene: what is added to.
-      clip: the journey.
-      left: `[W]` bool, which waypoints are not reached yet.
+      scene: the scene.
+      clip: the clip.
+      left: `[W]` bool, whether each waypoint is not yet reached.
       now: seconds since the start.
       goal_radius: metres.
       size: of the robot, metres.
@@ -111,7 +112,7 @@ def mark(
 def add(
     scene: mujoco.MjvScene, kind: int, size: tuple[float, ...], place: np.ndarray, colour: RGBA
 ) -> mujoco.MjvGeom:
-    """One more thing in a scene; the last one again where there is no room."""
+    """Adds a geom to a scene; if the scene is full, it replaces the last geom."""
     scene.ngeom = min(scene.ngeom + 1, scene.maxgeom)
     geom = scene.geoms[scene.ngeom - 1]
     upright = np.eye(3).reshape(-1)
@@ -123,7 +124,7 @@ def add(
 def add_line(
     scene: mujoco.MjvScene, a: np.ndarray, b: np.ndarray, radius: float, colour: RGBA
 ) -> None:
-    """A round line in a scene, from a to b `[3]`."""
+    """Adds a line from a to b `[3]`, a capsule, to a scene."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
     mujoco.mjv_connector(add(scene, kind, (radius,) * 3, a, colour), kind, radius, a, b)
 
@@ -144,14 +145,14 @@ def _clip(
 
 
 def _way(clip: Clip, now: float) -> np.ndarray:
-    """The way up to a time `[n, 3]`, on the floor, in pieces of a length that can be seen."""
-    made = clip.position[clip.times <= now + 1e-6] * (1, 1, 0) + (0, 0, LINE)
-    length = np.cumsum(np.linalg.norm(np.diff(made, axis=0, prepend=made[:1]), axis=1))
-    return made[np.unique(length // PIECE, return_index=True)[1]]
+    """Points `[n, 3]` of the trail on the floor up to the time `now`, about PIECE apart."""
+    points = clip.position[clip.times <= now + 1e-6] * (1, 1, 0) + (0, 0, LINE)
+    length = np.cumsum(np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1))
+    return points[np.unique(length // PIECE, return_index=True)[1]]
 
 
 def _cameras(clip: Clip, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
-    """Behind the robot and to its side, so that where it goes is in the picture."""
+    """Cameras behind the robot and to its side, so that the goal is in the frame."""
     ahead = clip.goal(clip.times)[:, :2] - clip.position[:, :2]
     turn = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     calm = np.c_[_calm(clip.position, CALM_PLACE, clip), _calm(turn, CALM_TURN, clip)]
@@ -165,12 +166,12 @@ def _cameras(clip: Clip, seconds: np.ndarray, size: float) -> list[mujoco.MjvCam
 
 
 def _calm(x: np.ndarray, sigma: float, clip: Clip) -> np.ndarray:
-    """`x [t, …]` smoothed over `sigma` seconds; beyond its ends it stays as it is."""
+    """`x [t, …]` smoothed with a Gaussian of `sigma` seconds; the end values are repeated."""
     return gaussian_filter1d(x, sigma / clip.dt, axis=0, mode="nearest")
 
 
 def _gauge(clip: Clip, now: float) -> str:
-    """Time, and the distance to the next waypoint."""
+    """Text with the time and the horizontal distance to the next waypoint."""
     at = np.array([now])
     apart = np.linalg.norm((clip.goal(at) - clip.place(at))[0, :2])
     return f"{now:.1f} s   {apart:.2f} m"

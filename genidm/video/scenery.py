@@ -1,4 +1,4 @@
-"""Where videos are made: a floor with squares of one metre, light, and colours that tell apart."""
+"""The scene of videos: a floor with squares of one metre, lights, and distinct colours."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 
 SUN = (-0.4, 0.3, -1.0)
-# Metres from what the camera looks at to the sun: it goes along, and the shadows with it.
+# Metres from the camera's focus to the sun, which moves with the focus and so do the shadows.
 SUN_AWAY = 12.0
 REACH_OF_SHADOWS = 20.0  # metres
 RGBA = tuple[float, float, float, float]
 
-# Okabe and Ito's: vermilion, bluish green, blue.
+# Colours of Okabe and Ito: vermilion, bluish green, blue.
 TO_GO: RGBA = (0.835, 0.369, 0.0, 1.0)
 REACHED: RGBA = (0.0, 0.62, 0.451, 1.0)
 TRAIL: RGBA = (0.0, 0.447, 0.698, 1.0)
@@ -20,15 +20,15 @@ FLOOR_NAME = "genidm floor"
 
 
 def scene(visual_model: mujoco.MjSpec, width: int, height: int) -> mujoco.MjModel:
-    """A robot's visual model on the video's floor, in its light.
+    """Compiles a robot's visual model with the floor and the lights of videos.
 
     Args:
-      visual_model: of the robot; its own floor and lights are left out.
-      width: pixels of the greatest picture.
-      height: pixels.
+      visual_model: of the robot; its own planes, lights and skies are removed.
+      width: pixels of the largest frame.
+      height: pixels of the largest frame.
     """
     spec = visual_model.copy()
-    # Else the floor, which nothing collides with, would be left out of what comes from a URDF.
+    # A model from a URDF discards geoms without collisions, such as this floor.
     spec.compiler.discardvisual = False
     planes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
     skies = [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
@@ -43,7 +43,7 @@ def scene(visual_model: mujoco.MjSpec, width: int, height: int) -> mujoco.MjMode
     spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
     spec.visual.headlight.specular = (0, 0, 0)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    # Shadows are as sharp as this is small, but there is noise on the floor that lies farther.
+    # A smaller extent makes sharper shadows, but the floor beyond it shows noise.
     spec.stat.extent = REACH_OF_SHADOWS
     return spec.compile()
 
@@ -63,7 +63,7 @@ def _floor(spec: mujoco.MjSpec) -> None:
 
 
 def size(model: mujoco.MjModel, qpos: np.ndarray) -> float:
-    """Metres from the middle of a robot to its farthest part, in the pose `qpos [nq]`."""
+    """Metres from the centre of a robot to its farthest part, in the pose `qpos [nq]`."""
     data = mujoco.MjData(model)
     data.qpos = qpos
     mujoco.mj_kinematics(model, data)
