@@ -120,12 +120,8 @@ def who_set_what(
       up to three lines: settings that `resolve` chose, that the user set, and that differ from
       the paper.
     """
-    inverse = isinstance(given, InverseDynamics) and given.name == method.name
-    papers = paper_settings(given) if inverse else given
-        paper_settings(method)
-        if isinstance(method, InverseDynamics) and given.name == method.name
-        else given
-    )
+    ours = isinstance(given, InverseDynamics) and given.name == method.name
+    papers = paper_settings(given) if ours else given
     lines = []
     for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),
