@@ -11,7 +11,7 @@ import pytest
 
 from experiments import physics
 from genidm import report
-from genidm.report import paper
+from genidm.paper import protocol
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
@@ -203,4 +203,4 @@ def test_table_1_is_the_papers() -> None:
     assert {
         robot: {name: (float(cells[2 * n]), float(cells[2 * n + 1])) for name, *cells in rows}
         for n, robot in enumerate(robots)
-    } == paper.TABLE1
+    } == protocol.TABLE1
