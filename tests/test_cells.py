@@ -130,7 +130,7 @@ def test_what_is_no_summary_spoils_no_report(copy: Path, capsys, content: str) -
     foreign.write_text(content)
     command(copy)
     said = capsys.readouterr()
-    assert said.out.startswith(was) and f"{foreign} is no summary of a test" in said.err
+    assert said.out.startswith(was) and f"{foreign} is not the summary of a test" in said.err
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_who_has_set_what_is_known(monkeypatch, tmp_path: Path) -> None:
     assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
     assert given == "LR, set by you: fit.batch_size 64 (512)"
     assert papers.startswith(
-        "LR, not the paper's (--paper-settings has those): fit.mean_latent False (True)"
+        "LR, unlike the paper (see --paper-settings): fit.mean_latent False (True)"
     )
 
 

@@ -110,7 +110,7 @@ def interrupted(command: list[str], ready: bool, seconds: float) -> tuple[int, s
 def test_ctrl_c_in_a_checkpoint_is_a_sentence_and_leaves_it_whole(
     tmp_path: Path, seconds: float
 ) -> None:
-    said = "stopped: the same command goes on where it was\n"
+    said = "stopped: run the same command again to resume\n"
     assert interrupted(["-c", SAVING, str(tmp_path)], True, seconds) == (130, said)
     assert all(path.name.startswith("step_") for path in tmp_path.iterdir())
     latest = Checkpoints(tmp_path).latest(

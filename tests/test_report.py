@@ -166,7 +166,7 @@ def test_comparisons_have_no_columns_for_training_seeds_that_are_not_there():
     r = document([row("RL"), row("LR")])
     (line,) = [x for x in report.markdown(r).splitlines() if x.startswith("| LR-RL")]
     assert line.count("|") == table.BRIEF + 1
-    assert "then over the training seeds" not in report.text(r)
+    assert "last three: all training seeds" not in report.text(r)
 
 
 def test_half_a_training_seed_is_not_lost_in_rounding():
@@ -179,11 +179,11 @@ def test_half_a_training_seed_is_not_lost_in_rounding():
 
 def test_the_notes_tell_which_numbers_are_over_which_seeds(rows):
     notes = report.text(document(rows)).replace("\n", " ")
-    assert "All but “over seeds” is of training seed 0" in notes
-    assert "“Over seeds” is of 3 training seeds" in notes
-    assert "tested on 4 × 50 episodes" in notes and "GE 0." in notes
+    assert "Every column except “over seeds” uses training seed 0" in notes
+    assert "“Over seeds” uses 3 training seeds" in notes
+    assert "seeds after the first: 4 × 50 test episodes" in notes and "GE 0." in notes
     only = report.text(document([row("LR")])).replace("\n", " ")
-    assert "“Over seeds” is of" not in only
+    assert "“Over seeds” uses" not in only
     other = row("GE", collecting_seeds={5: outcome(1.0)})
     assert "one training seed (GE 5, LR 0)" in report.text(document([other, row("LR")]))
 
@@ -191,7 +191,7 @@ def test_the_notes_tell_which_numbers_are_over_which_seeds(rows):
 def test_the_notes_hold_the_invariance():
     r = document([row("LR", invariance=0.1234), row("HF", invariance=2.3e-6), row("x")])
     assert "LR 0.12, HF 2.3e-06." in report.text(r).replace("\n", " ")
-    assert "turned alike" not in report.text(document([row("LR")]))
+    assert "rotated together" not in report.text(document([row("LR")]))
 
 
 def test_the_order_of_the_rows_is_kept(rows):
@@ -524,7 +524,7 @@ def test_rows_of_one_make_say_it_in_one_sentence(rows):
     made_alike = [dataclasses.replace(row, made=made()) for row in rows]
     text = table.markdown(document(made_alike))
     assert "- Commit: aaaaaaaaaa." in text and "- Versions: numpy 2.0." in text
-    assert "- Hardware: four cores." in text and "different code" not in text
+    assert "- Hardware: four cores." in text and "code differs" not in text
 
 
 def test_rows_of_other_code_and_another_machine_are_named(rows):

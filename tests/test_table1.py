@@ -217,9 +217,9 @@ def test_the_training_seeds_stand_beside(finished: Path) -> None:
         assert (over["seeds"], over["episodes"]) == ([0, 1], [[10, 2], [10, 1]])
         assert over["means"][0] == method["mean"] != over["means"][1]
     text = (finished / "results" / "point_0.25_table.txt").read_text()
-    assert "All but “over seeds” is of training seed 0" in text
-    assert "“Over seeds” is of 2 training seeds" in text
-    assert "after the first tested on 10 × 1 episodes" in text.replace("\n", " ")
+    assert "Every column except “over seeds” uses training seed 0" in text
+    assert "“Over seeds” uses 2 training seeds" in text
+    assert "seeds after the first: 10 × 1 test episodes" in text.replace("\n", " ")
 
 
 def test_invariance_is_measured_on_one_record_for_all(finished: Path) -> None:

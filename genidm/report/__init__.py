@@ -1,4 +1,4 @@
-"""Tables and figures from episodes: everything here derives from what the evaluation left."""
+"""Tables and figures, made from the files of finished tests."""
 
 from genidm.paper.protocol import TABLE1
 from genidm.report.figures import (

@@ -1,8 +1,8 @@
-"""How figures look: a style a method, axes, keys, and a picture on disk that is whole.
+"""The look of figures: styles of methods, axes, legends, and atomic writing of PNGs.
 
-A method has one colour, marker, line and hatch in every figure (`STYLES`). The colours are
-Okabe and Ito's, which the colour-blind tell apart; the others do it in grey print.
-Nothing here touches pyplot or its global state.
+A method has the same colour, marker, line and hatch in every figure (`STYLES`). The colours are
+Okabe and Ito's, which colour-blind readers can distinguish; markers, lines and hatches remain
+distinct in grey print. Nothing here uses pyplot or its global state.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DPI = 150
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """How a method is drawn.
+    """The look of a method in figures.
 
     Attributes:
       colour: hexadecimal RGB.
@@ -53,7 +53,7 @@ STYLES = {
     "LR": Style("#0072B2", "o", "-", ".."),
     "HF": Style("#D55E00", "D", (0, (5, 1)), "++"),
 }
-"""Method → style, the same in every figure."""
+"""Method → its style in every figure."""
 
 _SPARE = (
     Style("#0072B2", "o", "-", ""),
@@ -67,7 +67,7 @@ _SPARE = (
 
 
 def styles(names: Iterable[str]) -> dict[str, Style]:
-    """A style for each name: a method's own, and for the others what no method here uses."""
+    """A style for each name: `STYLES`, or for other names a style that is still free."""
     names = list(names)
     taken = {STYLES[n].colour for n in names if n in STYLES}
     free = [s for s in _SPARE if s.colour not in taken] or list(_SPARE)
@@ -76,12 +76,12 @@ def styles(names: Iterable[str]) -> dict[str, Style]:
 
 
 def write(fig: Figure, path: Target) -> Figure:
-    """Writes beside `path` and moves into place, so that no reader sees half a picture."""
+    """Writes a PNG beside `path` and renames it, so that no reader sees an incomplete file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        # Without the version of Matplotlib in it, equal figures are equal files.
+        # Matplotlib's version in the file would make equal figures differ.
         fig.savefig(part, dpi=DPI, format="png", metadata={"Software": None})
         os.replace(part, path)
     finally:
@@ -90,7 +90,7 @@ def write(fig: Figure, path: Target) -> Figure:
 
 
 def style_axes(ax: Axes, xlabel: str, ylabel: str) -> None:
-    """Axes with their labels, where there are any, and little else."""
+    """Sets labels and removes most decoration."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=10)
     ax.grid(axis="y", color="0.9", linewidth=0.8)
@@ -102,36 +102,36 @@ def style_axes(ax: Axes, xlabel: str, ylabel: str) -> None:
 
 
 def line(ax: Axes, x: Array, y: Array, style: Style) -> None:
-    """A method's line, with a few of its markers."""
+    """Draws a method's line with a few markers."""
     every = max(1, len(x) // 8)
     ax.plot(x, y, **strokes(style), linewidth=1.8, markevery=every, markersize=5)
 
 
 def strokes(style: Style) -> dict[str, Any]:
-    """A method's colour, line and marker, as Matplotlib's functions take them."""
+    """A method's colour, line and marker, as keyword arguments for Matplotlib."""
     drawn = {"color": style.colour, "linestyle": style.line, "marker": style.marker}
-    # Yellow is hardly seen on white, unless it has an edge.
+    # Yellow is hard to see on white without an edge.
     edge = [withStroke(linewidth=2.4, foreground="0.35")]
     return drawn | {"path_effects": edge} if _light(style.colour) else drawn
 
 
 def _light(colour: str) -> bool:
-    """Whether a colour is nearly as bright as paper, by its relative luminance."""
+    """Whether a colour is almost white, by its relative luminance."""
     linear = np.asarray(to_rgb(colour)) ** 2.2
     return bool(linear @ [0.2126, 0.7152, 0.0722] > 0.6)
 
 
 def line_key(fig: Figure, looks: Mapping[str, Style], extra: Sequence[Line2D] = ()) -> None:
-    """A legend of methods drawn as lines, and of whatever else is given."""
+    """Adds a legend of the methods' lines and of `extra` handles."""
     lines = [Line2D([], [], label=name, **strokes(s)) for name, s in looks.items()]
     key(fig, [*lines, *extra])
 
 
 def key(fig: Figure, handles: Sequence[Line2D], edge: str = "upper") -> None:
-    """A legend above or below the axes, in as many columns as fit."""
+    """Adds a legend above or below the axes, in as many columns as fit."""
     if not handles:
         return
-    # Inches at 9 points: a handle with its gaps, and a letter.
+    # Inches at font size 9: 0.73 for a handle with its gaps, 0.07 for a letter.
     widths = [0.73 + 0.07 * len(str(h.get_label())) for h in handles]
     fitting = max(1, int(fig.get_figwidth() / max(widths)))
     columns = len(handles) if sum(widths) < fig.get_figwidth() else min(len(handles), fitting)

@@ -1,4 +1,4 @@
-"""The figures, each a function of data and a path that writes a PNG and returns the Figure."""
+"""Figures. Each function takes data and a path, writes a PNG and returns the Figure."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from genidm.report.rows import Row
 
 Panel = tuple[str, Mapping[str, Sequence[Array]], Array, float]
 
-TARGET_RADIUS = 0.1  # metres; what counts as reached, drawn to scale
-ABREAST = 5  # methods side by side in a figure of trajectories
-BESIDE = 0.2  # of the distance between violins; how far from the middle the means stand
+TARGET_RADIUS = 0.1  # metres; a target counts as reached within it; drawn to scale
+ABREAST = 5  # most methods side by side in a figure of trajectories
+BESIDE = 0.2  # offset of the means from a violin's middle; violins are 1 apart
 TARGET_RED = "#D00000"
-CURVE_POINTS = 100  # of a learning curve; what lies between is noise of single iterations
-FLOOR = 1e-8  # metres; where a log axis shows a residual of exactly 0
-LINEAR = 1e-2  # changes of the action below this are on the linear part of their axis
-NOISE = 1e-3  # and below this, float noise
+CURVE_POINTS = 100  # points of a learning curve; averaging removes the noise of iterations
+FLOOR = 1e-8  # metres; a log axis shows a residual of exactly 0 here
+LINEAR = 1e-2  # the axis of action changes is linear below this
+NOISE = 1e-3  # action changes below this are float noise
 CHOSEN: dict[str, Any] = {"color": "0.45", "linestyle": (0, (6, 3)), "linewidth": 1}
 SINGLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "mfc": "white", "ms": 5}
 
@@ -44,18 +44,18 @@ METRICS = {
     "loss_latent": "latent loss L1 (Eq. 5)",
     "loss_action": "action loss L2 (Eq. 6)",
 }
-"""Metric → label of its axis; any other metric is labelled by its own name."""
+"""Metric → axis label; the label of any other metric is its name."""
 
 
 def violins(
     rows: Sequence[Row], path: Target, paper: Mapping[str, tuple[float, float]] | None = None
 ) -> Figure:
-    """Closest distance by method, over all test episodes (Fig. 5).
+    """Violins of the closest distance over all test episodes, by method (Fig. 5).
 
     Args:
-      rows: one a method, drawn in this order; diverged episodes are left out.
+      rows: one per method, drawn in this order; diverged episodes are left out.
       path: PNG to write.
-      paper: method → (mean, std) in metres, as in `paper.TABLE1[robot]`; the mean is marked.
+      paper: method → (mean, std) in metres, as in `protocol.TABLE1[robot]`; marks the mean.
     """
     fig = Figure(figsize=(max(5.0, 1.1 * len(rows) + 1.6), 4.4), layout="constrained")
     ax = fig.add_subplot()
@@ -73,13 +73,13 @@ def violins(
 
 
 def paths(panels: Sequence[Panel], path: Target) -> Figure:
-    """Ways walked towards targets seen and unseen while learning (Fig. 8), one row a panel.
+    """Trajectories towards targets (Fig. 8), one row of axes per panel.
 
-    More methods than a page is wide stand in bands below each other.
+    If there are more methods than fit side by side, the rows repeat for the next methods.
 
     Args:
-      panels: (title, method → trajectories, each `[T, 2]` metres, targets `[E, 2]` metres, heading
-        at the start in radians). Every method of a panel has its own axes, equally scaled.
+      panels: (title, method → trajectories `[T, 2]` in metres, targets `[E, 2]` in metres,
+        initial heading in radians). Each method has its own axes, all with the same limits.
       path: PNG to write.
     """
     methods = list(dict.fromkeys(name for panel in panels for name in panel[1]))
@@ -105,15 +105,14 @@ def learning_curves(
     keys: Sequence[str] | None = None,
     steps: str = "steps",
 ) -> Figure:
-    """Metrics while learning, one panel a metric, one line a label, smoothed where it is long.
+    """Learning curves, one panel per metric and one line per label; long curves are averaged.
 
     Args:
-      curves: label → records with "step" and metrics, as a run's JSONL holds them; a record
-        need not hold every metric. What stands behind a comma in a label ("PPO, seed 1")
-        names one of several runs, which are drawn alike.
+      curves: label → records with "step" and metrics, as in `metrics.jsonl`; a record need not
+        have every metric. Labels that agree up to a comma ("PPO, seed 1") have the same style.
       path: PNG to write.
-      keys: the metrics to draw, in order; by default every number of the records.
-      steps: what "step" counts, the label of the horizontal axis ("interactions", "updates").
+      keys: metrics to draw, in order; default: every number in the records.
+      steps: label of the horizontal axis: the unit of "step" ("interactions", "updates").
     """
     keys = list(keys) if keys is not None else _metrics(curves)
     columns = max(1, min(3, len(keys)))
@@ -131,11 +130,11 @@ def learning_curves(
 
 
 def residuals(curves: Mapping[str, Mapping[str, Array]], path: Target) -> Figure:
-    """How far 𝒢's replay is from the exactly turned record, by step since placing (Def. 1, 4).
+    """Distance of 𝒢's replay from the exactly rotated record, by step (Def. 1, 4).
 
     Args:
-      curves: mode of 𝒢 → "median" and "p90", each `[H]` metres, of the first to the H-th step
-        after placing. A residual of exactly 0 is drawn at the axis' foot.
+      curves: mode of 𝒢 → "median" and "p90", each `[H]` metres, for steps 1 to H after the
+        replay starts from the record. Values of 0 are drawn at the bottom of the axis.
       path: PNG to write.
     """
     fig = Figure(figsize=(6.4, 4.2), layout="constrained")
@@ -157,15 +156,16 @@ def residuals(curves: Mapping[str, Mapping[str, Array]], path: Target) -> Figure
 
 
 def bearings(closest: Mapping[str, Array], bearing: Array, heading: Array, path: Target) -> Figure:
-    """Closest distance against where the target lies and which way the robot faces.
+    """Closest distance against the target's bearing and against the initial heading.
 
-    The first panel shows turns that a method never learned, the second where it is not
-    invariant to yaw. Marks are means of bins, bars their standard errors over episodes.
+    The left panel shows whether a method turns to targets at its sides, the right panel whether
+    it is invariant to yaw. Marks are means of bins, bars are standard errors over episodes.
 
     Args:
       closest: method → closest distance in metres, `[seeds, episodes]`; NaN is left out.
-      bearing: radians, `[seeds, episodes]`; of the target from the heading, left positive.
-      heading: radians, `[seeds, episodes]`; yaw at the start, in the world frame.
+      bearing: bearing of the target from the heading, `[seeds, episodes]` radians, positive to
+        the left.
+      heading: initial yaw in the world frame, `[seeds, episodes]` radians.
       path: PNG to write.
     """
     fig = Figure(figsize=(9.0, 3.9), layout="constrained")
@@ -188,14 +188,14 @@ def bearings(closest: Mapping[str, Array], bearing: Array, heading: Array, path:
 
 
 def invariance(changes: Mapping[str, Array], angle: Array, path: Target) -> Figure:
-    """How much actions change when robot and goal are turned alike, by angle (Def. 3).
+    """Change of actions when robot and goal are rotated together, by angle (Def. 3).
 
-    Marks are medians over states, bars their quartiles. The axis is linear below `LINEAR`, so
-    that 0 stands on it; a method that never leaves float noise is named beside its number.
+    Marks are medians over states, bars are quartiles. The axis is linear below `LINEAR`, so that
+    it can show 0. A method with only float noise is labelled with its maximum.
 
     Args:
-      changes: method → Euclidean distances of the actions `[K, N]`, of N states.
-      angle: radians `[K]`, that they are turned by.
+      changes: method → Euclidean distances of the actions `[K, N]` in N states.
+      angle: rotation angles `[K]`, radians.
       path: PNG to write.
     """
     fig = Figure(figsize=(7.4, 4.6), layout="constrained")
@@ -218,16 +218,16 @@ def invariance(changes: Mapping[str, Array], angle: Array, path: Target) -> Figu
 def latent_sizes(
     closest: Mapping[int, Sequence[Array]], path: Target, chosen: int | None = None
 ) -> Figure:
-    """Closest distance against the size k of the latent (Fig. 9).
+    """Closest distance against the latent size k (Fig. 9).
 
-    The line is the mean over fits, with the 95 % interval over test seeds of one fit, or the
-    standard deviation over several, which are also shown one by one.
+    The line is the mean over fits. Bars are the 95 % interval over test seeds (one fit per k) or
+    the standard deviation over fits (several per k, also drawn one by one).
 
     Args:
-      closest: k → each fit's closest distances in metres, `[seeds, episodes]`; NaN is left
+      closest: k → closest distances of each fit in metres, `[seeds, episodes]`; NaN is left
         out.
       path: PNG to write.
-      chosen: the k that Table 1 has; marked.
+      chosen: the k of Table 1, marked by a line.
     """
     fig = Figure(figsize=(6.4, 4.2), layout="constrained")
     ax = fig.add_subplot()
@@ -239,7 +239,7 @@ def latent_sizes(
     if chosen is not None:
         ax.axvline(chosen, **CHOSEN)
     if several:
-        x = np.repeat(np.multiply(sizes, 1.07), [len(fits) for fits in means])  # beside the bars
+        x = np.repeat(np.multiply(sizes, 1.07), [len(fits) for fits in means])  # right of the bars
         ax.plot(x, np.concatenate(means), **SINGLE, color=style.colour)
     _bars(ax, np.asarray(sizes, float), middle, bars, style)
     ax.set_xscale("log")
@@ -286,17 +286,17 @@ def _violin_key(paper: bool) -> list[Line2D]:
 
 
 def _bands(names: Sequence[str]) -> list[list[str]]:
-    """Names in as few rows as hold them, the rows as even as can be."""
+    """Splits names into rows of at most `ABREAST`, of nearly equal length."""
     count = max(1, -(-len(names) // ABREAST))
     width = -(-len(names) // count)
     return [list(names[i * width : (i + 1) * width]) for i in range(count)]
 
 
 def _panel(axes: Array, names: Sequence[str], panel: Panel, looks: Mapping[str, Style]) -> None:
-    """A row of axes `[columns]`, one a method; those that are left over go."""
+    """Draws a row of axes `[columns]`, one per method; removes the unused axes."""
     title, trajectories, targets, heading = panel
     walked = itertools.chain(*trajectories.values())
-    limits = _square([np.asarray(targets), *(_near(way, targets) for way in walked)])
+    limits = _square([np.asarray(targets), *(_near(path, targets) for path in walked)])
     for ax, name in zip(axes, names, strict=False):
         _targets(ax, targets)
         _trajectories(ax, trajectories.get(name, ()), looks[name], heading, limits)
@@ -322,9 +322,9 @@ def _trajectories(
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
     line = drawing.strokes(style) | {"marker": "", "linestyle": "-", "linewidth": 1.2}
-    for way in map(np.asarray, trajectories):
-        ax.plot(way[:, 0], way[:, 1], **line)
-        ax.plot(*way[-1], marker=style.marker, color=style.colour, mec="black", mew=0.6, ms=5)
+    for path in map(np.asarray, trajectories):
+        ax.plot(path[:, 0], path[:, 1], **line)
+        ax.plot(*path[-1], marker=style.marker, color=style.colour, mec="black", mew=0.6, ms=5)
     if len(trajectories):
         length = 0.12 * (limits[0][1] - limits[0][0])
         tip = trajectories[0][0] + length * np.array([np.cos(heading), np.sin(heading)])
@@ -332,18 +332,18 @@ def _trajectories(
         ax.annotate("", tip, trajectories[0][0], arrowprops=arrow, zorder=6)
 
 
-def _near(way: Array, targets: Array) -> Array:
-    """The points of a way `[n, 2]` not much farther from its start than the farthest target.
+def _near(path: Array, targets: Array) -> Array:
+    """The points of a trajectory `[n, 2]` within 1.5 × the farthest target's distance.
 
-    Who misses a target and walks on for a minute would else make all the others small.
+    A robot that misses its target and walks on would otherwise set the scale of all axes.
     """
-    way, targets = np.asarray(way), np.asarray(targets)
-    most = 1.5 * np.linalg.norm(targets - way[0], axis=-1).max()
-    return way[np.linalg.norm(way - way[0], axis=-1) <= most]
+    path, targets = np.asarray(path), np.asarray(targets)
+    most = 1.5 * np.linalg.norm(targets - path[0], axis=-1).max()
+    return path[np.linalg.norm(path - path[0], axis=-1) <= most]
 
 
 def _square(points: Iterable[Array]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits (x, y) of one length that hold all finite points `[N, 2]` and a margin."""
+    """Limits (x, y) of a square that contains all finite points `[N, 2]` and a margin."""
     stacked = np.concatenate([np.reshape(p, (-1, 2)) for p in points])
     stacked = stacked[np.isfinite(stacked).all(axis=1)]
     low, high = (stacked.min(0), stacked.max(0)) if len(stacked) else (np.zeros(2), np.ones(2))
@@ -368,7 +368,7 @@ def _metrics(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
 
 
 def _family(label: str) -> str:
-    """What runs that are drawn alike have in common: the label up to a comma."""
+    """The label up to a comma; curves with equal families have the same style."""
     return label.partition(",")[0]
 
 
@@ -378,7 +378,7 @@ def _curve_panel(
     key: str,
     looks: Mapping[str, Style],
 ) -> None:
-    """One metric; losses on a log axis where they allow it."""
+    """Draws one metric; a loss on a log axis if all its values are positive."""
     least = np.inf
     for name, records in curves.items():
         points = np.array([(r["step"], r[key]) for r in records if key in r], float)
@@ -392,9 +392,9 @@ def _curve_panel(
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Points `[N, 2]`, where there are many, as means over `CURVE_POINTS` equal runs of them."""
-    runs = np.array_split(points, min(CURVE_POINTS, len(points)))
-    return np.array([run.mean(0) for run in runs])
+    """Means of points `[N, 2]` over at most `CURVE_POINTS` groups of consecutive points."""
+    groups = np.array_split(points, min(CURVE_POINTS, len(points)))
+    return np.array([group.mean(0) for group in groups])
 
 
 def _residual(ax: Axes, curve: Mapping[str, Array], style: Style) -> None:
@@ -413,7 +413,7 @@ def _residual(ax: Axes, curve: Mapping[str, Array], style: Style) -> None:
 
 
 def _name_noise(ax: Axes, changes: Mapping[str, Array]) -> None:
-    """Numbers for the methods whose changes are too small for the axis."""
+    """Labels the methods whose changes are too small for the axis with their maximum."""
     greatest = {name: float(np.max(values)) for name, values in changes.items()}
     for row, (name, most) in enumerate((n, m) for n, m in greatest.items() if m < NOISE):
         number = f"{most:.0e}".replace("e-0", "e-")
@@ -424,12 +424,12 @@ def _name_noise(ax: Axes, changes: Mapping[str, Array]) -> None:
 
 
 def _deviations(means: Sequence[Sequence[float]]) -> Array:
-    """Standard deviations over fits, as bars `[2, n]`."""
+    """Standard deviations over fits, as error bars `[2, n]`."""
     return np.stack([[np.std(fits, ddof=1) for fits in means]] * 2)
 
 
 def _intervals(fits: Sequence[Array], middle: Array) -> Array:
-    """95 % intervals over test seeds, as bars `[2, n]` from the means."""
+    """95 % intervals over test seeds, as error bars `[2, n]` from the means."""
     low, high = np.array([stats.interval(fit) for fit in fits]).T
     return np.stack([middle - low, high - middle])
 
@@ -443,12 +443,12 @@ def _size_key(style: Style, several: bool, chosen: int | None) -> list[Line2D]:
 
 
 def _shifts(count: int, most: float = 0.12) -> Array:
-    """Where in its bin each of `count` methods stands, so that bars do not hide each other."""
+    """Horizontal offsets of `count` methods in a bin, so that bars do not hide each other."""
     return np.linspace(-most, most, count) if count > 1 else np.zeros(count)
 
 
 def _bars(ax: Axes, x: Array, y: Any, error: Any, style: Style) -> None:
-    """A method's line with a bar at every mark."""
+    """Draws a method's line with error bars."""
     ax.errorbar(x, y, error, **drawing.strokes(style), markersize=5, capsize=2)
 
 

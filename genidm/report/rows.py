@@ -1,4 +1,4 @@
-"""The results of all methods, a method a row, as one JSON document."""
+"""The results of all methods as one JSON document, one row per method."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from genidm.provenance import code_digest
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What a method did in the test, and what it took to get there.
+    """A method's test results, and the interactions and settings that led to them.
 
     Attributes:
-      method: its name; Table 1's for a method of the paper (RS, RL, GE, LR, ...).
-      episodes: the test, arrays `[seeds, episodes]`.
-      interactions: control steps of the robot while collecting, counted once.
-      replayed: control steps replayed by 𝒢 (Def. 4).
-      settings: how it was collected and fitted; anything that JSON can hold.
-      collecting_seeds: training seed → the test of the method that learned with it; the
-        first is `episodes`. A seed is of all that is learned: the experience, 𝒢, the fit.
-        Empty where it is not known.
-      invariance: mean change of the action when robot and goal are turned alike
-        (`genidm.evaluation.invariance`); None where it was not measured.
+      method: name; Table 1's name for a method of the paper (RS, RL, GE, LR, ...).
+      episodes: test results, arrays `[seeds, episodes]`.
+      interactions: environment steps that were collected.
+      replayed: environment steps that 𝒢 replayed (Def. 4).
+      settings: settings of agent and fit; any value that JSON can hold.
+      collecting_seeds: training seed → test results of the run with that seed; the first is
+        `episodes`. The seed determines experience, 𝒢 and fit. Empty if unknown.
+      invariance: mean change of the action when robot and goal are rotated together
+        (`genidm.evaluation.invariance`); None if not measured.
+      made: stage → what made it (`origin`).
     """
 
     method: str
@@ -51,31 +51,32 @@ def results(
     scenarios: str,
     engine: Any = None,
 ) -> dict[str, Any]:
-    """The rows as one JSON document, methods in the order given; distances in metres.
+    """Builds the JSON document of the rows, in the given order; distances in metres.
 
     Args:
-      rows: one a method; neighbours are also compared on the same scenarios, and the
+      rows: one per method. Neighbouring rows are compared on the same scenarios, and the
         paper's method with every other row.
-      robot: its name, as in Table 1.
-      scale: "quick", "paper" or a number of interactions.
+      robot: name of the robot, as in Table 1.
+      scale: name of the scale: "quick", "paper" or a fraction.
       scenarios: sha256 of the scenarios.
-      engine: what stepped the robot; None if it steps itself.
+      engine: engine that stepped the robot; None if the robot has no engine.
 
     Returns:
-      robot, engine, scale, scenarios; methods: name → `stats.summary` with interactions,
-      replayed, settings, what `made` each stage, and where they are known the training_seed of
-      all of these, the invariance and, of several training seeds, collecting_seeds: the seeds,
-      the episodes of each and `stats.spread`; paired: "LR-GE" → `stats.paired` of LR against
-      GE with, of several training seeds that both have, their `stats.paired_spread`; other_code:
-      module → digest of its code → methods, of modules that the rows have in several versions.
-      A number that does not exist is null.
+      robot, engine, scale, scenarios, and
+      methods: name → `stats.summary`, interactions, replayed, settings, `made` (stage → origin)
+      and, if known, training_seed, invariance and collecting_seeds (several training seeds:
+      seeds, episodes per seed, `stats.spread`);
+      paired: "LR-GE" → `stats.paired` of LR against GE and, if both have several training
+      seeds in common, `stats.paired_spread` over these;
+      other_code: module → digest → methods, for modules whose code differs between rows.
+      A missing number is null.
 
     Raises:
-      ValueError: a method stands in two rows, or two rows saw different scenarios.
+      ValueError: two rows have the same method, or two rows have different scenarios.
     """
     names = [row.method for row in rows]
     if len(set(names)) != len(names):
-        raise ValueError(f"a method stands in two rows: {names}")
+        raise ValueError(f"two rows have the same method: {names}")
     return {
         "robot": robot,
         "engine": engine and str(engine),
@@ -110,15 +111,15 @@ def _method(row: Row) -> dict[str, Any]:
 
 
 def origin(code: Mapping[str, str], sessions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What made a stage; a table's JSON keeps it with the digest of its code.
+    """Summarises what made a stage: code, commit, versions, machine, commands.
 
     Args:
-      code: of the stage (`Stage.code`).
-      sessions: which commands worked on it (`Stage.made`), at least one.
+      code: code of the stage (`Stage.code`).
+      sessions: the commands that worked on the stage (`Stage.made`), at least one.
 
     Returns:
-      code; commit, clean, versions, hardware and command of the command that
-      finished it; commands: how many worked on it; seconds: of all that were not killed.
+      code; commit, clean, versions, hardware and command of the last session; commands: the
+      number of sessions; seconds: their total time, without killed sessions.
     """
     last = sessions[-1]
     names = ("commit", "clean", "versions", "hardware", "command")
@@ -131,7 +132,7 @@ def origin(code: Mapping[str, str], sessions: Sequence[Mapping[str, Any]]) -> di
 
 
 def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
-    """Modules that the rows' stages have in several versions: digest → methods."""
+    """Modules whose code differs between the rows: module → digest → methods."""
     found: dict[str, dict[str, list[str]]] = {}
     for row in rows:
         for module, digest in itertools.chain(*(o["code"].items() for o in row.made.values())):
@@ -142,7 +143,7 @@ def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
 
 
 def _compared(rows: Sequence[Row]) -> Iterator[tuple[Row, Row]]:
-    """Each row and the one above it; then the paper's method and the rows not next to it."""
+    """Yields each row with the row above it, then the paper's method with all other rows."""
     yield from ((b, a) for a, b in itertools.pairwise(rows))
     for i, row in enumerate(rows):
         if row.method == METHOD:
@@ -160,11 +161,11 @@ def _pair(a: Row, b: Row) -> dict[str, Any]:
 
 
 def jsonable(value: Any, digits: int | None = None) -> Any:
-    """What JSON can hold: NumPy's numbers as Python's, NaN and infinity as null.
+    """Converts a value for JSON: NumPy numbers to Python's, NaN and infinity to null.
 
     Args:
-      value: dicts, lists, numbers and text; anything else becomes its `str`.
-      digits: of floats behind the point; all, unless given.
+      value: dicts, lists, numbers and text; any other value becomes its `str`.
+      digits: decimals of floats; default: all.
     """
     if isinstance(value, Mapping):
         return {str(k): jsonable(v, digits) for k, v in value.items()}

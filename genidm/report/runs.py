@@ -1,4 +1,4 @@
-"""The finished tests of a robot, found where their stages lie."""
+"""Find the finished tests of a robot among its stages on disk."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from genidm.store import DONE, MADE, Stage
 
 @dataclasses.dataclass(frozen=True)
 class Tested:
-    """A finished test, as its stage holds it.
+    """A finished test on disk.
 
     Attributes:
-      directory: of the stage.
-      summary: what it was finished with.
+      directory: directory of its stage.
+      summary: summary of its stage (`Stage.summary`).
     """
 
     __test__ = False  # not a test case for pytest
@@ -43,7 +43,7 @@ class Tested:
 
     @property
     def episodes(self) -> Episodes:
-        """The outcome."""
+        """Results of the test, arrays `[seeds, episodes]`."""
         return Episodes(**self._tree["episodes"])
 
     @property
@@ -54,7 +54,7 @@ class Tested:
 
     @property
     def made(self) -> dict[str, dict[str, Any]]:
-        """Stage → what made it, the test last; stages that are no longer there are left out."""
+        """Stage → what made it (`origin`), the test last; deleted stages are left out."""
         root = self.directory.parent
         stages = [Stage(root / name) for name in self.summary.get("stages", [])]
         there = [s for s in (*stages, Stage(self.directory)) if s.path(MADE).exists()]
@@ -62,20 +62,20 @@ class Tested:
 
     @property
     def controller(self) -> Path:
-        """Where the controller lies that was tested."""
+        """Path of the tested controller."""
         return self.directory.parent / self.summary["fit"] / "controller"
 
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """All that a report is made from.
+    """The tests of a report.
 
     Attributes:
-      robot: whose report it is.
-      root: where its stages lie.
-      scenarios: the scenarios of the table.
-      found: method → its tests, one a training seed, in the order of the rows; the table's
-        own test, on the scenarios, is the first.
+      robot: the robot.
+      root: directory that contains the stages.
+      scenarios: scenarios of the table.
+      found: method → its tests, one per training seed, in the order of the rows. The first is
+        the table's own test, on `scenarios`.
     """
 
     robot: Robot
@@ -84,7 +84,7 @@ class Runs:
     found: dict[str, list[Tested]]
 
     def row(self, name: str, invariance: float | None = None) -> Row:
-        """The row of a method."""
+        """The table row of a method."""
         tests = self.found[name]
         return Row(
             method=name,
@@ -99,13 +99,13 @@ class Runs:
 
     @property
     def records(self) -> list[Path]:
-        """The stages of the records that the rows learned from, as far as they are finished."""
+        """Finished stages of the records that the rows learned from."""
         tests = (test for found in self.found.values() for test in found)
         names = {t.summary["experience"] for t in tests if "experience" in t.summary}
         return [self.root / name for name in sorted(names) if Stage(self.root / name).done]
 
     def last_chunk(self) -> Path | None:
-        """The last part of the record that a row learned from: the lowest that has one here."""
+        """The last chunk of the record of the lowest row that has one on disk; None if no row has."""
         for tests in reversed(self.found.values()):
             stage = tests[0].summary.get("experience")
             chunks = sorted(self.root.glob(f"{stage}/experience/chunk_*")) if stage else []
@@ -122,19 +122,18 @@ def find(
     settings: EvaluationSettings,
     own: Sequence[Path] = (),
 ) -> Runs:
-    """The tests of every method that was tested on some scenarios.
+    """Finds the tests of every method that was tested on some scenarios.
 
-    A method's row is its newest test with the lowest training seed; its newest tests with
-    the other seeds, on whatever part of the scenarios, give the spread. Tests in `own` count as the
-    newest.
+    A method's row is its newest test with the lowest training seed. Its newest tests with other
+    seeds, on any part of the scenarios, give the spread. Tests in `own` count as newest.
 
     Args:
-      robot: whose they are.
-      root: where its stages lie.
-      scenarios: the scenarios of the table.
-      scale: the scale that the methods were run at.
-      settings: of the test.
-      own: directories of the tests that the caller asked for.
+      robot: the robot.
+      root: directory that contains the stages.
+      scenarios: scenarios of the table.
+      scale: scale of the runs.
+      settings: settings of the test.
+      own: directories of tests that count as newest.
     """
     done = _finished(robot, root, scale, settings, own)
     return Runs(robot, root, scenarios, _by_method(done, scenarios.digest()))
@@ -143,7 +142,7 @@ def find(
 def _finished(
     robot: Robot, root: Path, scale: str, settings: EvaluationSettings, own: Sequence[Path]
 ) -> Iterator[Tested]:
-    """All finished tests at a scale, on the robot's engine, oldest first."""
+    """Finished tests with this scale, these settings and the robot's engine, oldest first."""
     done = sorted(
         root.glob(f"test-*/{DONE}"), key=lambda path: (path.parent in own, path.stat().st_mtime)
     )
@@ -153,20 +152,20 @@ def _finished(
             summary = files.load_json(path)
             found = (summary["scale"], summary["test"], summary["engine"])
         except (BadInput, KeyError, TypeError):
-            # Of an older version, or of something else: no reason to have no report at all.
-            print(f"warning: {path} is no summary of a test, and is left out", file=sys.stderr)
+            # One file of an older version, or of another program, must not prevent the report.
+            print(f"warning: {path} is not the summary of a test; left out", file=sys.stderr)
             continue
         if found == asked:
             yield Tested(path.parent, summary)
 
 
 def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
-    """Method → its newest test of each training seed, the one on the scenarios first."""
+    """Method → its newest test of each training seed, tests on the scenarios first."""
     newest: dict[str, dict[int, Tested]] = {}
     for test in done:
         seeds = newest.setdefault(test.summary["method"], {})
         kept = seeds.get(test.summary["seed"])
-        # A test on another part of the scenarios does not stand in for one on the scenarios.
+        # A test on other scenarios never replaces a test on the table's scenarios.
         if not kept or kept.summary["scenarios"] != digest or test.summary["scenarios"] == digest:
             _warn_of_another(kept, test)
             seeds[test.summary["seed"]] = test
@@ -182,12 +181,12 @@ def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
 
 
 def _warn_of_another(kept: Tested | None, test: Tested) -> None:
-    """Says so where a row is replaced by one of the same name that was made otherwise."""
+    """Warns if a row is replaced by one of the same name with other settings."""
     if kept and kept.summary["settings"] != test.summary["settings"]:
         name = test.summary["method"]
         print(
-            f"warning: the row {name} is of {test.summary['fit']} and no longer of "
-            f"{kept.summary['fit']}, made with other settings; "
-            "--method.name gives each a row of its own",
+            f"warning: the row {name} now shows {test.summary['fit']} instead of "
+            f"{kept.summary['fit']}, which has other settings; "
+            "use --method.name to give each its own row",
             file=sys.stderr,
         )

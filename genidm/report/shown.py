@@ -1,4 +1,4 @@
-"""What the figures of a report show, computed once from the stages of its methods."""
+"""The data of a report's figures, computed once from the stages of its methods."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class Shown:
     """The data of the figures.
 
     Attributes:
-      closest: method → closest distance `[seeds, episodes]`, metres; NaN where it diverged.
-      heading, bearing: `[seeds, episodes]`, radians: of the robot at the start, and of the
-        target from it.
-      panels: the trajectories of Fig. 8.
-      collecting: agent → metrics while it collected.
-      learning: method → metrics while its agent learned to go to goals.
+      closest: method → closest distance `[seeds, episodes]`, metres; NaN for diverged episodes.
+      heading: initial heading of the robot `[seeds, episodes]`, radians.
+      bearing: bearing of the target from that heading `[seeds, episodes]`, radians.
+      panels: trajectories of Fig. 8.
+      collecting: agent → metrics during collecting.
+      learning: method → metrics while its agent learned to reach goals.
       fitting: method → metrics of its fit.
       residuals: mode of 𝒢 → its residual (`genidm.paper.generalize.residual`).
-      changes: method → change of its actions `[angles, states]` at `ANGLES`; empty where no
-        record lies to draw states from.
+      changes: method → change of its actions `[angles, states]` at `ANGLES`; empty if there is
+        no record to sample states from.
     """
 
     closest: dict[str, np.ndarray]
@@ -49,13 +49,13 @@ class Shown:
     changes: dict[str, np.ndarray]
 
     def invariance(self, name: str) -> float | None:
-        """Mean change of a method's action, over states and all turns but 0; None if unknown."""
+        """Mean change of a method's action over states and angles above 0; None if unknown."""
         change = self.changes.get(name)
         return None if change is None else float(change[ANGLES > 0].mean())
 
 
 def gather(runs: Runs) -> Shown:
-    """All that the figures of a report show."""
+    """Collects the data of all figures of a report."""
     heading, bearing = _angles(runs.robot, runs.scenarios)
     learned = {name: _metrics(tests[0].controller.parent) for name, tests in runs.found.items()}
     return Shown(
@@ -74,10 +74,10 @@ def gather(runs: Runs) -> Shown:
 
 
 def _panels(runs: Runs) -> list[Panel]:
-    """Fig. 8: the trajectories of each method towards targets seen and unseen while learning."""
+    """Trajectories of Fig. 8, from an initial heading of training and from an unseen heading."""
     target = np.asarray(fig8_scenarios(runs.robot).target)
     trajectories = {
-        name: [way[:, :2] for way in tests[0].trajectories] for name, tests in runs.found.items()
+        name: [path[:, :2] for path in tests[0].trajectories] for name, tests in runs.found.items()
     }
     return [
         (
@@ -96,12 +96,12 @@ def _panels(runs: Runs) -> list[Panel]:
 
 
 def _angles(robot: Robot, scenarios: Scenarios) -> tuple[np.ndarray, np.ndarray]:
-    """Heading at the start, and the target's bearing from it, `[seeds, episodes]`, radians."""
+    """Initial heading and the target's bearing from it, each `[seeds, episodes]`, radians."""
 
     def angles(keys: jax.Array, yaw: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
         state = robot.reset(keys, yaw)
-        way = target - state.position
-        bearing = jax.numpy.arctan2(way[:, 1], way[:, 0]) - state.heading
+        goal = target - state.position
+        bearing = jax.numpy.arctan2(goal[:, 1], goal[:, 0]) - state.heading
         return state.heading, symmetry.wrap(bearing)
 
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), scenarios)
@@ -119,7 +119,7 @@ def _collecting(runs: Runs) -> Curves:
 
 
 def _residuals(runs: Runs) -> dict[str, dict[str, np.ndarray]]:
-    """Those of the replays of the rows' records; of two with one mode the last by name."""
+    """Residuals of the replays of the rows' records; of several with one mode, the last by name."""
     records = {stage.name for stage in runs.records}
     done = (path.parent for path in sorted(runs.root.glob("replay-*/done.json")))
     of_rows = [
@@ -130,7 +130,7 @@ def _residuals(runs: Runs) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _changes(runs: Runs) -> dict[str, np.ndarray]:
-    """How much the actions of every controller change in the states of one record, `[K, N]`."""
+    """Method → change of its actions `[angles, states]`, in the states of one record."""
     chunk = runs.last_chunk()
     if chunk is None:
         return {}

@@ -1,4 +1,4 @@
-"""The table of the results beside the paper's Table 1, as plain text and as Markdown."""
+"""The results table beside the paper's Table 1, as plain text and as Markdown."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ COMPARED = (
     *("pair", "difference, m", "95 % interval", "nearer in"),
     *("over seeds", "95 % interval", "nearer in"),
 )
-BRIEF = 4  # columns of the comparisons where there is one training seed
+BRIEF = 4  # columns of the comparisons if there is only one training seed
 
 
 def text(results: Mapping[str, Any]) -> str:
-    """The table for a terminal, aligned, beside the paper's numbers; then the comparisons."""
+    """The table as aligned text for a terminal, then its notes and the paired comparisons."""
     body = _aligned(_cells(results))
     rule = "─" * max(map(len, body))
     notes = itertools.chain(*(textwrap.wrap(note, 110) for note in _notes(results)))
@@ -33,7 +33,7 @@ def text(results: Mapping[str, Any]) -> str:
 
 
 def markdown(results: Mapping[str, Any]) -> str:
-    """The table for a README, beside the paper's numbers; then the comparisons."""
+    """The table as Markdown, then its notes and the paired comparisons."""
     notes = [f"- {note}" for note in _notes(results)]
     lines = [_caption(results), "", *_piped(_cells(results)), "", *notes]
     compared = _comparisons(results)
@@ -65,7 +65,7 @@ def _row(name: str, m: Mapping[str, Any], paper: tuple[float, float] | None) -> 
 
 
 def _aligned(cells: Sequence[tuple[str, ...]]) -> list[str]:
-    """Lines in columns of one width, the first to the left and the others to the right."""
+    """Lines with aligned columns: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = []
     for name, *rest in cells:
@@ -75,7 +75,7 @@ def _aligned(cells: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def _piped(cells: Sequence[tuple[str, ...]]) -> list[str]:
-    """The same in Markdown."""
+    """Lines of a Markdown table."""
     header, *rows = ("| " + " | ".join(row) + " |" for row in cells)
     return [header, "|:--" + "|--:" * (len(cells[0]) - 1) + "|", *rows]
 
@@ -84,39 +84,39 @@ def _caption(results: Mapping[str, Any]) -> str:
     sizes = {f"{m['seeds']} × {m['episodes']}" for m in results["methods"].values()}
     over = f" over {sizes.pop()} episodes" if len(sizes) == 1 else ""
     scale = f"{results['robot']}, scale {results['scale']}"
-    return f"{scale}: closest distance to the target in metres{over}; paper: its Table 1."
+    return f"{scale}: closest distance to the target in metres{over}; “paper”: its Table 1."
 
 
 def _notes(results: Mapping[str, Any]) -> list[str]:
     methods = results["methods"]
     notes = [
-        "Interactions + replayed steps.",
-        f"All but “over seeds” is of {_one_seed(methods)}: the mean and standard deviation over "
-        "all its test episodes; the interval is a bootstrap over its test seeds.",
+        "“Interactions”: environment steps that were collected + steps that 𝒢 replayed.",
+        f"Every column except “over seeds” uses {_one_seed(methods)}: mean and standard deviation "
+        "over all test episodes; the interval is a bootstrap over the test seeds.",
     ]
     if results.get("engine"):
-        notes.append(f"Stepped by {results['engine']}.")
+        notes.append(f"Physics engine: {results['engine']}.")
     several = {name: m["collecting_seeds"] for name, m in methods.items() if _several(m)}
     if several:
         notes.append(_over_seeds(several))
     turned = [f"{name} {m['invariance']:.2g}" for name, m in methods.items() if "invariance" in m]
     if turned:
         notes.append(
-            "Mean change of the action when robot and goal are turned alike by up to 180° "
+            "Mean change of the action when robot and goal are rotated together by up to 180° "
             f"(Def. 3): {', '.join(turned)}."
         )
     notes += _origins(methods)
     for module, digests in results.get("other_code", {}).items():
         versions = ", ".join(f"{code} in {' '.join(rows)}" for code, rows in digests.items())
-        notes.append(f"The rows were made by different code: {module} is {versions}.")
+        notes.append(f"The code differs between rows: {module} is {versions}.")
     lost = [f"{name} {100 * m['diverged']:.2f} %" for name, m in methods.items() if m["diverged"]]
     if lost:
-        notes.append(f"Diverged, and so in no mean: {', '.join(lost)}.")
+        notes.append(f"Diverged episodes, left out of all means: {', '.join(lost)}.")
     return notes
 
 
 def _origins(methods: Mapping[str, Any]) -> Iterator[str]:
-    """Which commit, versions and machine made the rows."""
+    """Notes on the commit, versions and machine that made the rows."""
     made = {name: m["made"] for name, m in methods.items() if m.get("made")}
     for what, name in (("Commit", "commit"), ("Versions", "versions"), ("Hardware", "hardware")):
         of_rows = {row: _values(stages, name) for row, stages in made.items()}
@@ -124,7 +124,7 @@ def _origins(methods: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _values(stages: Mapping[str, Any], name: str) -> str:
-    """What the stages of a row have under a name, each value once."""
+    """The values that the stages of a row have under a name, each once."""
     found = []
     for origin in stages.values():
         value = origin[name]
@@ -137,7 +137,7 @@ def _values(stages: Mapping[str, Any], name: str) -> str:
 
 
 def _by_value(what: str, of_rows: Mapping[str, str]) -> Iterator[str]:
-    """One sentence where all rows agree, else one that names the rows."""
+    """One sentence if all rows agree, else one that names the rows of each value."""
     values = dict.fromkeys(of_rows.values())
     if len(values) == 1:
         yield f"{what}: {next(iter(values))}."
@@ -147,7 +147,7 @@ def _by_value(what: str, of_rows: Mapping[str, str]) -> Iterator[str]:
 
 
 def _one_seed(methods: Mapping[str, Any]) -> str:
-    """Which training seed the rows are of."""
+    """The training seed of the rows, in words."""
     seeds = {name: m["training_seed"] for name, m in methods.items() if "training_seed" in m}
     if len(set(seeds.values())) == 1:
         return f"training seed {next(iter(seeds.values()))}"
@@ -156,16 +156,16 @@ def _one_seed(methods: Mapping[str, Any]) -> str:
 
 
 def _over_seeds(several: Mapping[str, Any]) -> str:
-    """What the column over training seeds holds, and the intervals that it has no room for."""
+    """Explains the column “over seeds”, and gives its intervals."""
     numbers = sorted({len(over["means"]) for over in several.values()})
     sizes = {f"{s} × {e}" for over in several.values() for s, e in over["episodes"][1:]}
-    after = f", after the first tested on {sizes.pop()} episodes" if len(sizes) == 1 else ""
-    text = f"“Over seeds” is of {'–'.join(map(str, numbers))} training seeds, each learned anew"
-    text += f"{after}: the mean and standard deviation of the means of their tests."
+    after = f"; seeds after the first: {sizes.pop()} test episodes" if len(sizes) == 1 else ""
+    text = f"“Over seeds” uses {'–'.join(map(str, numbers))} training seeds (each a complete run"
+    text += f"{after}): mean and standard deviation of the means of their tests."
     bounds = {name: over["ci95"] for name, over in several.items() if over["ci95"][0] is not None}
     named = ", ".join(f"{n} {_metres(low)}–{_metres(high)}" for n, (low, high) in bounds.items())
-    of_three = " (of three: the least and the greatest)" if 3 in numbers else ""
-    return f"{text} 95 % by bootstrap{of_three}: {named}." if named else text
+    of_three = " (with three seeds: minimum–maximum)" if 3 in numbers else ""
+    return f"{text} 95 % bootstrap intervals{of_three}: {named}." if named else text
 
 
 def _several(method: Mapping[str, Any]) -> bool:
@@ -173,18 +173,19 @@ def _several(method: Mapping[str, Any]) -> bool:
 
 
 def _comparisons(results: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The paired differences as a table of their own; with training seeds, where there are."""
+    """The table of paired differences; with columns over training seeds if any pair has them."""
     rows = [_comparison(name, pair) for name, pair in results["paired"].items()]
     over = any(_several(pair) for pair in results["paired"].values())
     return [row if over else row[:BRIEF] for row in (COMPARED, *rows)] if rows else []
 
 
 def _legend(compared: Sequence[tuple[str, ...]]) -> str:
-    """What the numbers of the comparisons are over."""
-    text = "On the same scenarios, negative where the first is nearer: with one training seed,"
-    text += " over its test seeds"
-    several = any(len(row) > BRIEF for row in compared)
-    return f"{text}; then over the training seeds." if several else f"{text}."
+    """Explains the columns of the comparisons."""
+    text = "Paired differences on the same scenarios; negative: the first method comes nearer."
+    if not any(len(row) > BRIEF for row in compared):
+        return f"{text} Intervals over test seeds."
+    text += " First columns: one training seed, intervals over its test seeds"
+    return f"{text}; last three: all training seeds."
 
 
 def _comparison(name: str, pair: Mapping[str, Any]) -> tuple[str, ...]:
@@ -220,7 +221,7 @@ def _percent(share: float | None) -> str:
 
 
 def _count(n: int) -> str:
-    """A count to three digits: 2 M, 1.05 M, 50 k, 640."""
+    """A count with three significant digits: 2 M, 1.05 M, 50 k, 640."""
     for unit, name in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if n >= 0.9995 * unit:
             return f"{n / unit:.3g} {name}"

@@ -1,4 +1,4 @@
-"""Fig. 7: trajectories through waypoints, and how the body lies along them."""
+"""Fig. 7: trajectories through waypoints, and the heading of the body along them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from genidm.evaluation.waypoints import WaypointRuns
 from genidm.report import drawing
 from genidm.report.drawing import Style, Target, styles
 
-ARROW = 0.6  # metres; the length of an arrow that shows where the body points
-EVERY = 1.0  # seconds from one arrow to the next
+ARROW = 0.6  # metres; length of an arrow that shows the heading
+EVERY = 1.0  # seconds between arrows
 
 
 def draw_waypoint_runs(
     by_method: Mapping[str, WaypointRuns], goal_radius: float, path: Target
 ) -> Figure:
-    """All trajectories from above, one column a method; below, how far they are from the path.
+    """Trajectories from above, one column per method; below, their distance from the path.
 
     Args:
-      by_method: method → its runs, all through the same waypoints.
-      goal_radius: metres; waypoints are drawn as discs of this radius.
+      by_method: method → its runs; all methods have the same waypoints.
+      goal_radius: radius of the waypoints' discs, metres.
       path: PNG to write.
     """
     columns = len(by_method)
@@ -45,14 +45,14 @@ def draw_waypoint_runs(
 
 
 def _above(ax: Axes, made: WaypointRuns, style: Style, goal_radius: float) -> None:
-    """Ways, waypoints in their order, and the body of the first journey's robot."""
+    """Draws all trajectories, the numbered waypoints, and the headings of the first run."""
     corners = np.concatenate([made.position[0, :1, :2], made.waypoints[0, :, :2]])
     ax.plot(*corners.T, color="0.6", linestyle=":", linewidth=1.2, zorder=1)
     for number, (x, y) in enumerate(corners[1:], 1):
         ax.add_patch(Circle((x, y), goal_radius, facecolor="none", edgecolor="black", zorder=3))
         ax.annotate(str(number), (x, y), (6, 6), textcoords="offset points", fontsize=10, zorder=6)
-    for way, steps in zip(made.position, made.steps, strict=True):
-        ax.plot(*way[: steps + 1, :2].T, color=style.colour, linewidth=1.0, alpha=0.7, zorder=2)
+    for path, steps in zip(made.position, made.steps, strict=True):
+        ax.plot(*path[: steps + 1, :2].T, color=style.colour, linewidth=1.0, alpha=0.7, zorder=2)
     stride = max(1, round(EVERY / made.dt))
     shown = np.arange(0, made.steps[0] + 1, stride)
     points, angles = made.position[0, shown, :2], made.heading[0, shown]

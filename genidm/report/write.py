@@ -1,4 +1,4 @@
-"""The report of a robot's runs: the table and the figures, from what lies on disk."""
+"""Write the report of a robot's runs: the table and the figures, from files on disk."""
 
 from __future__ import annotations
 
@@ -32,15 +32,16 @@ def report(
     """Writes the table and the figures of all methods that were tested on some scenarios.
 
     Args:
-      robot: whose report it is.
-      root: where its stages lie.
-      scenarios: the scenarios of the table.
-      scale: the scale that the methods were run at.
-      settings: of the test.
-      results: also write the table, its numbers and the figures there, under names that begin
-        with the robot's, the engine's where it has several, and the scale's but for "paper".
-      own: directories of the tests that the caller asked for; they are rows, also where there
-        are newer tests of methods with the same names.
+      robot: the robot.
+      root: directory that contains the stages.
+      scenarios: scenarios of the table.
+      scale: scale of the runs.
+      settings: settings of the test.
+      results: also write the table, its numbers and the figures to this directory. The names
+        begin with the robot, the engine (if the robot has several) and the scale (unless
+        "paper").
+      own: directories of tests that become rows even if another test of the same method is
+        newer.
 
     Returns:
       the directory of the report.
@@ -73,7 +74,7 @@ def _document(runs: Runs, rows: list[Row], scale: str) -> dict[str, Any]:
 def _write(
     directory: Path, prefix: str, name: str, written: dict[str, Any], rows: list[Row], shown: Shown
 ) -> None:
-    """The table as JSON under `name`, as Markdown and text, and the figures."""
+    """Writes the table, as JSON under `name`, as Markdown and as text, and the figures."""
     with files.disk(directory):
         directory.mkdir(parents=True, exist_ok=True)
     with alone(directory):  # another command may write the same report
@@ -88,7 +89,7 @@ def _write_alone(
     drawn = _draw(directory, prefix, rows, shown, TABLE1.get(written["robot"]))
     text = f"{table.text(written)}\n\nFigures in {directory}: {', '.join(drawn)}"
     if not shown.changes:
-        text += "\nNo figure of invariance: no record lies here to draw states from."
+        text += "\nNo invariance figure: there is no record to sample states from."
     files.save_text(directory / f"{prefix}table.txt", f"{text}\n")
 
 
@@ -99,7 +100,7 @@ def _draw(
     shown: Shown,
     paper: Mapping[str, tuple[float, float]] | None,
 ) -> list[str]:
-    """Draws what there is data for; the names of the files, in alphabetical order."""
+    """Draws the figures that have data; returns their file names in alphabetical order."""
     drawn = []
 
     def at(name: str) -> Path:

@@ -1,1 +1,1 @@
-"""From a method to its row of Table 1: what is run, in which stages, from the command line."""
+"""Runs of methods on robots: settings, scales, stages, reports and the command line."""

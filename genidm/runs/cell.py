@@ -1,4 +1,4 @@
-"""A cell of Table 1: made from a method, run to its row, filmed and reported."""
+"""One cell of Table 1 (a method on a robot): make the run, test it, render it, report it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from genidm.store import Stage
 
 
 def make_run(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Run[Any]:
-    """The cell of a method as scale and machine have it (`resolve`)."""
+    """Makes the run of a method, with its settings adapted to scale and machine (`resolve`)."""
     chosen = resolve(robot, method, options)
     return make_exact_run(robot, chosen, options, who_set_what(method, chosen, chosen))
 
@@ -32,9 +32,19 @@ def make_exact_run(
     options: Options,
     notes: tuple[str, ...] = (),
 ) -> Run[Any]:
-    """The cell of a method exactly as it is given; `notes` say who set what."""
+    """Makes the run of a method with exactly the given settings.
+
+    Args:
+      robot: the robot.
+      method: the method, used as it is.
+      options: options of the run.
+      notes: lines that say where settings come from (`who_set_what`).
+
+    Raises:
+      BadInput: the robot cannot be rendered, or a directory cannot be written.
+    """
     if options.video:
-        robot.visual_model()  # what cannot be rendered is said before anything is computed
+        robot.visual_model()  # a robot that cannot be rendered is an error before the computation
     for directory in (options.run_dir, options.report_dir):
         if directory is not None:
             files.check_writable(directory, directory=True)
@@ -48,16 +58,16 @@ def make_exact_run(
 
 
 def run_method(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Path:
-    """Runs the cell of a method, as scale and machine have it, and writes the report.
+    """Runs a method, with its settings adapted to scale and machine, and writes the report.
 
     Returns:
-      the directory of the report of all cells beside it.
+      the directory of the report, which covers all runs of the robot under `options.run_dir`.
     """
     return execute(make_run(robot, method, options), options)
 
 
 def execute(this: Run[Any], options: Options) -> Path:
-    """Runs a cell and writes the report of all cells beside it: its directory is returned."""
+    """Tests a run, renders it if asked, writes the report; returns the report's directory."""
     announce(this.robot, options.engine)
     say(this.notes)
     tested = scenarios_of(this, options)
@@ -70,21 +80,22 @@ def execute(this: Run[Any], options: Options) -> Path:
 def saved(
     runs: Sequence[Path], engine: str | None = None
 ) -> tuple[Robot, dict[str, tuple[ControllerFn, dict[str, Any]]]]:
-    """Controllers to be compared, from the directories of their runs.
+    """Loads the controllers of finished runs, for a comparison.
 
     Args:
-      runs: the directories.
-      engine: to step their robot with; chosen by what jax runs on, unless given.
+      runs: directories of the runs.
+      engine: engine that steps the robot; by default chosen from jax's device.
 
     Returns:
-      their robot; and by the method's name, or where two runs have the same also the run's,
-      the controller and what the run says of it.
+      the robot; and name → (controller, the run's summary). The name is the method's; if two
+      runs have the same method, the name of the run's directory follows.
 
     Raises:
-      BadInput: there are none, one is no finished run, or they are of different robots.
+      BadInput: no directory is given, a directory is not a finished run, or the runs are of
+        different robots.
     """
     if not runs:
-        raise BadInput("give the directory of a run: METHOD-SEED-… under --run-dir of a cell")
+        raise BadInput("give the directory of a run: METHOD-SEED-… in its --run-dir")
     robots: dict[str, Robot] = {}
     models: dict[str, tuple[ControllerFn, dict[str, Any]]] = {}
     for run in runs:
@@ -92,25 +103,25 @@ def saved(
         summary = stage.summary()
         if not isinstance(summary, dict) or not {"robot", "method"} <= summary.keys():
             raise BadInput(
-                f"{run} is no run of a controller: METHOD-SEED-… under --run-dir of a cell"
+                f"{run} is not the run of a controller; give METHOD-SEED-… in its --run-dir"
             )
         kind, name = str(summary["robot"]), shown(summary["method"])
         robots.setdefault(kind, by_name(kind, engine))
         model = stage.read(controller.load, ".", robots[kind])
         models[f"{name}, {run.resolve().name}" if name in models else name] = (model, summary)
     if len(robots) > 1:
-        raise BadInput(f"runs of one robot can be compared, not of {', '.join(sorted(robots))}")
+        raise BadInput(f"the runs must be of one robot, not of {', '.join(sorted(robots))}")
     (robot,) = robots.values()
     announce(robot, engine)
     return robot, models
 
 
 def render_run(this: Run[Any]) -> None:
-    """Renders a cell's test, beside its controller.
+    """Renders the test of a run to `video.html`, and to `video.gif` if frames can be drawn.
 
-    `video.html` and, where a picture can be drawn, `video.gif`.
+    Both lie in the directory of the controller.
     """
-    from genidm import video  # nor is this
+    from genidm import video  # slow to import, and needed only here
 
     stage = this.controller_stage
     made = video.render_run(stage.directory, robot=this.robot)
@@ -123,7 +134,7 @@ def render_run(this: Run[Any]) -> None:
 
 
 def scenarios_of(this: Run[Any], options: Options) -> Scenarios:
-    """The scenarios that a cell is tested on, as its scale or the user says."""
+    """The scenarios of a run's test; `options.episodes` overrides the scale."""
     episodes = this.scale.episodes if options.episodes is None else options.episodes
     return scenarios(this.robot, this.scale.seeds, episodes)
 
@@ -131,19 +142,19 @@ def scenarios_of(this: Run[Any], options: Options) -> Scenarios:
 def write_report(
     this: Run[Any], test_scenarios: Scenarios, options: Options, own: Iterable[Stage] = ()
 ) -> Path:
-    """The report of all cells that lie beside one, and were tested on some scenarios.
+    """Writes the report of all runs in the same directory that have this test.
 
     Args:
-      this: a cell of the report.
-      test_scenarios: the scenarios of the table.
-      options: scale, test, places.
-      own: tests that this command asked for: they are its rows, also where there are newer
-        tests of methods with the same names.
+      this: a run of the report.
+      test_scenarios: scenarios of the table.
+      options: scale, test settings, directories.
+      own: tests of this command. They become rows even if another test of the same method is
+        newer.
 
     Returns:
       the directory of the report.
     """
-    from genidm.report.write import report  # drawing is not needed before the end
+    from genidm.report.write import report  # slow to import (Matplotlib), needed at the end
 
     return report(
         this.robot, this.root, test_scenarios, this.scale.name, options.test, options.report_dir,
@@ -152,15 +163,15 @@ def write_report(
 
 
 def say(notes: Iterable[str]) -> None:
-    """Says on stderr who set what."""
+    """Prints notes on stderr."""
     for note in notes:
         print(note, file=sys.stderr)
 
 
 def announce(robot: Robot, engine: str | None) -> None:
-    """Says on stderr what steps a robot and, if the user named no `engine`, why."""
+    """Prints the robot's engine on stderr and, if the user gave no `engine`, the reason."""
     if robot.engine:
-        where = "an accelerator" if devices.accelerated() else "no accelerator"
+        where = "has an accelerator" if devices.accelerated() else "has no accelerator"
         others = " or ".join(name for name in robot.engines if name != robot.engine.name)
-        why = f": jax has {where}; --engine {others} instead" if engine is None and others else ""
+        why = f" (jax {where}; --engine {others} overrides)" if engine is None and others else ""
         print(f"{robot.name} on {robot.engine}{why}", file=sys.stderr)

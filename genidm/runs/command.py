@@ -1,4 +1,4 @@
-"""The command line of a cell, and what ends every command of ours: one sentence."""
+"""The command line of a run, and one-sentence error messages for every command."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from genidm.runs.resolve import Options, resolve, who_set_what
 
 
 def main(robot: Callable[..., Robot], method: GoalConditioned | InverseDynamics) -> None:
-    """The command line of a cell: `python -m experiments.ant_lr`.
+    """The command line of one cell of Table 1: `python -m experiments.ant_lr`.
 
-    The flags are read twice. The first time scale and engine; what they choose is what the flags
-    of the method start from the second time.
+    The flags are parsed twice: first scale and engine, which set the defaults of the method's
+    flags; then all flags.
     """
     description = f"{method.name} on the {robot.__name__}: one cell of Table 1, end to end."
     with in_sentences():
@@ -50,7 +50,7 @@ def _early(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> O
 def _settings(
     method: GoalConditioned | InverseDynamics,
 ) -> Callable[..., tuple[Options, GoalConditioned | InverseDynamics]]:
-    """A function whose parameters are the flags of a cell."""
+    """A function whose parameters are the flags of a run, for tyro."""
 
     def both(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
@@ -62,37 +62,37 @@ def _settings(
 
 
 def run_cli(command: Callable[..., None], description: str) -> None:
-    """Runs a command line; bad input, or Ctrl-C, ends in one sentence on stderr."""
+    """Runs a command line; bad input or Ctrl-C ends it with one sentence on stderr."""
     with in_sentences():
         _parse(command, description)
 
 
 def _parse(command: Callable[..., Any], description: str, **how: Any) -> Any:
-    """Calls a function with what the command line says."""
+    """Parses the command line and calls `command` with the values."""
     refuse(command, sys.argv[1:])
     return tyro.cli(command, description=description, config=(tyro.conf.AvoidSubcommands,), **how)
 
 
 @contextlib.contextmanager
 def in_sentences() -> Iterator[None]:
-    """Ends the program in one sentence on stderr where its input is bad, or at Ctrl-C.
+    """Ends the program with one sentence on stderr on bad input or Ctrl-C.
 
-    The exit status is 2 for bad input and 130, as a shell has it, for Ctrl-C.
+    The exit status is 2 for bad input, and 130 for Ctrl-C, as in a shell.
     """
     warnings.showwarning = _warn
     inherited = os.environ.get("MPLBACKEND")
-    # Files are written, no window is opened: not even where Jupyter's backend is inherited.
+    # Figures go to files: no window may open, also if Jupyter's backend is inherited.
     os.environ["MPLBACKEND"] = "Agg"
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # "≤" on a terminal that has none
+            stream.reconfigure(errors="replace")  # not every terminal can show "≤"
     try:
         devices.requested()
         requested_seconds()
         try:
             yield
         finally:
-            sys.stdout.flush()  # `… | head` may have ended: here that is caught, at the exit not
+            sys.stdout.flush()  # raises BrokenPipeError here, where it is caught, not at exit
     except BadInput as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -104,11 +104,11 @@ def in_sentences() -> Iterator[None]:
     except MemoryError as error:
         print(f"error: not enough memory: {error}", file=sys.stderr)
         sys.exit(2)
-    except BrokenPipeError:  # what reads the output has ended: `… | head`
+    except BrokenPipeError:  # the reader of the output has ended, as in `… | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)
     except KeyboardInterrupt:
-        print("stopped: the same command goes on where it was", file=sys.stderr)
+        print("stopped: run the same command again to resume", file=sys.stderr)
         sys.exit(130)
     finally:
         os.environ.pop("MPLBACKEND")
@@ -120,5 +120,5 @@ def _warn(
     message: Warning | str, category: Any, filename: str, lineno: int, file: Any = None,
     line: str | None = None,
 ) -> None:  # fmt: skip
-    """A warning as a user wants it: what is the matter, not which line of ours said so."""
+    """Prints a warning without the file and line that raised it."""
     print(f"warning: {message}", file=sys.stderr)

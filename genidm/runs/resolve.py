@@ -1,4 +1,4 @@
-"""One method as it is run: method + scale + machine + what the user sets, and who set what."""
+"""The settings of a run, from method, scale, machine and user, and where each comes from."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from genidm.runs.scale import Scale, scale_of
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What every cell takes.
+    """Options of every run.
 
     Attributes:
       scale: "paper" (A.1.2: all interactions, 10 seeds × 1000 episodes), "quick" (minutes),
-        or a number: that share of the paper's interactions, updates and episodes.
-      seed: training seed: of the experience, the replay and the fit. The test's are fixed.
-      engine: what steps the robot: "mjx", or "mujoco" for MuJoCo in C; MJX on an accelerator
-        and MuJoCo in C on a CPU, unless given. The Minitaur has "bullet" alone.
-      run_dir: where runs are kept. The same command again goes on where it was.
-      paper_settings: the paper's letter instead of our settings: h = 1, whole-episode replay,
+        or a number: this fraction of the paper's interactions, updates and episodes.
+      seed: training seed, of experience, replay and fit. The test seeds are fixed.
+      engine: engine that steps the robot: "mjx", or "mujoco" for MuJoCo in C. Default: MJX on
+        an accelerator, MuJoCo in C on a CPU. The Minitaur has only "bullet".
+      run_dir: directory of the runs. The same command resumes what it finds there.
+      paper_settings: use the paper's settings instead of ours: h = 1, whole-episode replay,
         λ = 0.25, mean latents, constant learning rate.
-      episodes: test episodes a seed; as the scale says, unless given.
+      episodes: test episodes per seed; default: as the scale sets.
       report_dir: also write the table and the figures to this directory.
-      video: also render three episodes of the test: a page and a gif, beside the controller.
-      other_code: take finished stages that other code made, and say so. Off, they are made anew.
-      test: the test (A.1.3).
+      video: also render three test episodes, as a page and a gif, beside the controller.
+      other_code: use finished stages that other code made, with a warning, instead of making
+        them again.
+      test: settings of the test (A.1.3).
     """
 
     scale: str = "paper"
@@ -50,20 +51,20 @@ class Options:
     test: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
 
     def __post_init__(self) -> None:
-        # A seed has 32 bits: jax would take 2³² for 0.
+        # A seed has 32 bits: jax would treat 2³² as 0.
         check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
 
 
 def resolve(
     robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
 ) -> GoalConditioned | InverseDynamics:
-    """A method as the scale, the machine and the robot's engine have it.
+    """Adapts a method's settings to the scale, the machine and the robot's engine.
 
-    On the command line this is what the flags of a method start from, so that what the user
-    sets stands, also where it equals a default.
+    On the command line the result gives the defaults of the method's flags, so a value that the
+    user sets is never overridden, even if it equals a default of the method.
 
     Raises:
-      BadInput: the scale is none, or the paper has no other settings for the method.
+      BadInput: the scale is invalid, or `paper_settings` does not apply to the method.
     """
     scale = scale_of(options.scale, robot.paper_interactions)
     agent = _at_scale(method.agent, scale)
@@ -71,7 +72,7 @@ def resolve(
     method = dataclasses.replace(method, agent=agent)
     if isinstance(method, GoalConditioned):
         if options.paper_settings:
-            raise BadInput(f"{method.name} has no settings that the paper's letter would change")
+            raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
         return method
     method = _fitting(paper_settings(method) if options.paper_settings else method, scale)
     if method.generalize:
@@ -80,7 +81,7 @@ def resolve(
 
 
 def _at_scale(agent: Any, scale: Scale) -> Any:
-    """PPO at its defaults as the scale has it, with its own layers; other agents as they are."""
+    """Replaces PPO at default settings by the scale's, keeping its layers; other agents stay."""
     if not isinstance(agent, PPO):
         return agent
     layers = agent.policy_hidden_layer_sizes
@@ -89,7 +90,7 @@ def _at_scale(agent: Any, scale: Scale) -> Any:
 
 
 def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
-    """The method as far as a scale's record is long enough for it."""
+    """Adapts updates, horizon and fractions to the scale's shorter record."""
     agent = method.agent
     if isinstance(agent, Frozen):
         agent = dataclasses.replace(agent, fraction=max(agent.fraction, scale.learning))
@@ -108,15 +109,16 @@ def who_set_what(
     chosen: GoalConditioned | InverseDynamics,
     given: GoalConditioned | InverseDynamics,
 ) -> tuple[str, ...]:
-    """Which settings are not those of the method, who set them, and which are not the paper's.
+    """Says which settings of a run differ from the method's defaults or from the paper, and why.
 
     Args:
-      method: with its defaults for the robot.
-      chosen: as scale, engine and machine have it.
-      given: as it is run.
+      method: the method with its defaults for the robot.
+      chosen: the method adapted to scale, engine and machine (`resolve`).
+      given: the method as it runs.
 
     Returns:
-      a line each for what is chosen, what the user set, and what differs from the paper.
+      up to three lines: settings that `resolve` chose, that the user set, and that differ from
+      the paper.
     """
     papers = (
         paper_settings(method)
@@ -127,7 +129,7 @@ def who_set_what(
     for who, before, after in (
         ("chosen for this scale and machine", method, chosen),
         ("set by you", chosen, given),
-        ("not the paper's (--paper-settings has those)", papers, given),
+        ("unlike the paper (see --paper-settings)", papers, given),
     ):
         changes = [c for c in differences(before, after) if not c.startswith("name ")]
         if changes:
@@ -136,7 +138,7 @@ def who_set_what(
 
 
 def differences(before: Any, after: Any) -> list[str]:
-    """Settings that differ, as "name value (value before)"."""
+    """The settings that differ, each as "name value (value before)"."""
     was, now = (flat(to_json(x)) for x in (before, after))
     return [
         f"{name} {now.get(name, 'absent')} ({was.get(name, 'absent')})"

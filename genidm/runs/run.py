@@ -1,10 +1,10 @@
-"""The stages of a cell of Table 1, each skipped when it is done.
+"""The stages of a run (one cell of Table 1); a finished stage is skipped.
 
     [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        InverseDynamics methods
                                               policy ──────▶ test        GoalConditioned methods
 
-Every stage has a directory that the settings it depends on name, so methods that agree
-on a stage share it, and a run that was killed goes on where it was.
+The name of a stage's directory contains a hash of all settings that the stage depends on:
+methods with equal settings share a stage, and a killed run resumes.
 """
 
 from __future__ import annotations
@@ -43,37 +43,37 @@ from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
 
-# Episodes of the test that can be rendered as they went.
+# Test episodes that are recorded for rendering.
 RECORDED_EPISODES = 3
-# What makes a record, beside the agent.
+# Module that makes a record, besides the agent's own.
 COLLECT = "genidm.agents.collect"
 
 
 class Trace(NamedTuple):
-    """What is kept of states `[B]`, so that an episode can be drawn and rendered."""
+    """The part of states `[B]` that is needed to plot and render an episode."""
 
     position: jax.Array
     physics: Any
 
 
 def position_and_physics(state: State) -> Trace:
-    """Keeps o and the physics."""
+    """Keeps o and the physics state."""
     return Trace(state.position, state.physics)
 
 
 @dataclasses.dataclass(frozen=True)
 class Run(abc.ABC, Generic[M]):
-    """One method on one robot, with one seed: its stages.
+    """One method on one robot with one training seed, as a series of stages.
 
     Attributes:
-      robot: what is steered.
-      method: how.
-      scale: how much of the protocol.
-      seed: of all that is learned; the test's are fixed.
-      root: directory of the stages.
+      robot: the robot.
+      method: the method.
+      scale: how much of the paper's protocol to do.
+      seed: training seed; the test seeds are fixed.
+      root: directory that contains the stages.
       test: settings of the test.
-      notes: who set what (`resolve.who_set_what`), stored with the test.
-      other_code: finished stages that other code made are used.
+      notes: where settings come from (`resolve.who_set_what`), stored with the test.
+      other_code: use finished stages that other code made.
     """
 
     robot: Robot
@@ -88,18 +88,18 @@ class Run(abc.ABC, Generic[M]):
     @property
     @abc.abstractmethod
     def controller_stage(self) -> Stage:
-        """Where the controller lies, once it is made."""
+        """The stage that makes the controller."""
 
     @abc.abstractmethod
     def controller(self) -> ControllerFn:
-        """What steers the robot in the test; made, unless it is there."""
+        """The controller of the test; made if its stage is not finished."""
 
     @property
     def config(self) -> dict[str, Any]:
-        """All that the run is made with, as JSON holds it; the names of its stages follow from it.
+        """All settings of the run.
 
         Returns:
-          robot, method, scale, seed, test; notes, which say who set what.
+          robot, method, scale, seed, test and notes, not yet converted to JSON.
         """
         names = ("method", "scale", "seed", "test", "notes")
         return {"robot": self.robot.settings} | {name: getattr(self, name) for name in names}
@@ -107,10 +107,10 @@ class Run(abc.ABC, Generic[M]):
     @property
     @abc.abstractmethod
     def sources(self) -> list[Stage]:
-        """The stages that the controller comes from, its own the last."""
+        """The stages that lead to the controller; the controller's own is the last."""
 
     def _stage(self, name: str, config: dict[str, Any], *code: Any) -> Stage:
-        """The stage of a config, made by this module, the robot's, its engine's and `code`."""
+        """The stage of a config; it depends on this module, the robot, its engine and `code`."""
         made_by = code_of(__name__, self.robot, self.robot.engine, config, *code)
         config = {"robot": self.robot.settings, "seed": self.seed} | config
         return Stage.open(self.root, name, config, made_by, self.other_code)
@@ -123,13 +123,13 @@ class Run(abc.ABC, Generic[M]):
         return jax.random.fold_in(jax.random.key(self.seed), stage)
 
     def _learning(self, agent: Any, interactions: int) -> dict[str, Any]:
-        """The config of a stage in which an agent is at work."""
+        """The config of a stage in which an agent collects or learns."""
         return {"agent": agent, "task": self.method.task, "interactions": interactions}
 
     def _collect(
         self, stage: Stage, agent: Agent, interactions: int, keep: bool = True
     ) -> tuple[Any, Policy | None]:
-        """Lets an agent work; what it saw, if that is kept, and the policy it ended with."""
+        """Runs an agent; returns its record (if `keep`) and its final policy, if it has one."""
         task = self.method.task
         record, learner = collect(
             self.robot, agent, interactions, self.seed, task=task, stage=stage, keep=keep
@@ -137,12 +137,12 @@ class Run(abc.ABC, Generic[M]):
         return record, agent.policy(self.robot, task, learner)
 
     def test_stage(self, scenarios: Scenarios, kind: str = "test") -> Stage:
-        """Where the test on a scenarios lies.
+        """The stage of the test on some scenarios.
 
         Args:
           scenarios: the scenarios.
-          kind: first word of the stage's name. The report shows all of kind "test"; those
-            of another kind are no rows of its table.
+          kind: first word of the stage's name. Only tests of kind "test" become rows of the
+            report's table.
         """
         source = self.controller_stage.directory.name
         config = {"fit": source, "scenarios": scenarios.digest(), "test": self.test}
@@ -150,7 +150,7 @@ class Run(abc.ABC, Generic[M]):
         return self._stage(f"{kind}-{self._label}", config, *code)
 
     def run_test(self, scenarios: Scenarios, kind: str = "test") -> Stage:
-        """The test (A.1.3), and the trajectories of Fig. 8; returns `test_stage`, finished."""
+        """Runs the test (A.1.3) and the episodes of Fig. 8; returns the finished `test_stage`."""
         stage = self.test_stage(scenarios, kind)
         stage.run_once(lambda: self._tested(stage, scenarios))
         return stage
@@ -183,7 +183,7 @@ class Run(abc.ABC, Generic[M]):
         )
 
     def _recordings(self, traces: list[Trace], target: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Episodes as `genidm.video` renders them; none of a robot without a visual model."""
+        """Recordings for `genidm.video`; an empty list if the robot has no visual model."""
         try:
             poses = [self.robot.visual_qpos(trace.physics) for trace in traces]
         except BadInput:
@@ -196,23 +196,23 @@ class Run(abc.ABC, Generic[M]):
 
 @dataclasses.dataclass(frozen=True)
 class InverseDynamicsRun(Run[InverseDynamics]):
-    """A method that fits an inverse dynamics model to experience.
+    """The run of a method that fits an inverse dynamics model to experience.
 
     Attributes:
-      repeat: which of several independent fits to the same pairs; 0 is the method's own.
+      repeat: number of an independent fit to the same pairs; 0 is the method's own fit.
     """
 
     repeat: int = 0
 
     @functools.cached_property
     def experience_stage(self) -> Stage:
-        """Where the record lies; shared by all methods with the same agent."""
+        """The stage of the record; methods with the same agent share it."""
         agent = self.method.agent
         config = self._learning(agent, self.scale.interactions)
         return self._stage(f"experience-{type(agent).__name__}-{self.seed}", config, COLLECT)
 
     def experience(self) -> Experience:
-        """What the agent saw while it learned (§4.1)."""
+        """The record E of the agent (§4.1); collected if its stage is not finished."""
         stage, made = self.experience_stage, list[Experience]()
         stage.run_once(lambda: self._collected(made))
         if made:
@@ -221,7 +221,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         return stage.read(experience.load_chunks, "experience", self.robot, recorded)
 
     def _collected(self, made: list[Experience]) -> dict[str, Any]:
-        """Collects; what it has in memory then goes into `made`."""
+        """Collects, and appends the record to `made`, so that it is not read from disk again."""
         stage, (agent, before) = self.experience_stage, self._collector()
         record, policy = self._collect(stage, agent, self.scale.interactions - before)
         if policy:
@@ -232,7 +232,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
     @functools.cached_property
     def agent_stage(self) -> Stage | None:
-        """Where the policy lies that collects once it is frozen; None for other agents."""
+        """The stage of the policy that is frozen and then collects; None for other agents."""
         frozen = self.method.agent
         if not isinstance(frozen, Frozen):
             return None
@@ -240,11 +240,11 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         return self._stage(f"agent-{type(frozen.agent).__name__}-{self.seed}", config, COLLECT)
 
     def _before(self, frozen: Frozen) -> int:
-        """Interactions after which an agent is frozen."""
+        """Interactions after which the agent is frozen."""
         return whole(frozen.agent, round(frozen.fraction * self.scale.interactions))
 
     def _collector(self) -> tuple[Agent, int]:
-        """What collects, and for how many interactions it has learned before."""
+        """The agent that collects, and the interactions in which it has learned before."""
         frozen, stage = self.method.agent, self.agent_stage
         if not isinstance(frozen, Frozen):
             return frozen, 0
@@ -253,7 +253,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
         def work() -> dict[str, Any]:
             _, policy = self._collect(stage, frozen.agent, interactions, keep=False)
-            assert policy  # both agents that can be frozen have one
+            assert policy  # every agent that can be frozen has a policy
             policy.save(stage.path("policy"), overwrite=True)
             return {"interactions": interactions}
 
@@ -264,7 +264,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
     @functools.cached_property
     def replay_stage(self) -> Stage | None:
-        """Where 𝒢(E) lies; None for a method that learns from the record alone."""
+        """The stage of 𝒢(E); None for a method that learns from the record alone."""
         m = self.method
         if m.generalize is None:
             return None
@@ -274,7 +274,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         return self._stage(name, config, "genidm.paper.generalize")
 
     def replay(self, record: Experience) -> RotatedReplay | None:
-        """𝒢(E) (Def. 4) of the part of the record that the method learns from."""
+        """𝒢(E) (Def. 4) of `record`, the part that the method learns from; None without 𝒢."""
         stage = self.replay_stage
         if stage is None:
             return None
@@ -290,9 +290,9 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
     @functools.cached_property
     def controller_stage(self) -> Stage:
-        """Where the controller lies."""
+        """The stage of the fitted controller."""
         source = self.replay_stage or self.experience_stage
-        # All that a method says but what its source is made with: a field that is new counts.
+        # All fields but those that the source stages contain, so that a new field counts too.
         config = {f.name: getattr(self.method, f.name) for f in dataclasses.fields(self.method)}
         for upstream in dataclasses.fields(Method):
             del config[upstream.name]
@@ -311,7 +311,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         return jax.random.fold_in(key, self.repeat) if self.repeat else key
 
     def controller(self) -> ControllerFn:
-        """The fitted models."""
+        """The fitted models; fitted if their stage is not finished."""
         stage = self.controller_stage
         stage.run_once(self._fitted)
         return stage.read(controller.load, "controller", self.robot)
@@ -342,7 +342,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
 @dataclasses.dataclass(frozen=True)
 class GoalConditionedRun(Run[GoalConditioned]):
-    """A method whose agent learns to go to goals, and whose policy is the controller."""
+    """The run of a method whose agent learns to reach goals; its policy is the controller."""
 
     @functools.cached_property
     def controller_stage(self) -> Stage:
@@ -354,7 +354,7 @@ class GoalConditionedRun(Run[GoalConditioned]):
         return [self.controller_stage]
 
     def controller(self) -> ControllerFn:
-        """The policy that the agent ended with."""
+        """The agent's final policy; learned if its stage is not finished."""
         stage = self.controller_stage
         stage.run_once(self._learned)
         return stage.read(controller.load, "controller", self.robot)
@@ -362,7 +362,7 @@ class GoalConditionedRun(Run[GoalConditioned]):
     def _learned(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
         _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
-        assert policy  # no GoalConditioned method has an agent that learns nothing
+        assert policy  # the agent of every GoalConditioned method learns one
         policy.save(stage.path("controller"), overwrite=True)
         interactions = whole(m.agent, self.scale.interactions)
         return {
@@ -381,13 +381,13 @@ def save_test(
     trajectories: list[np.ndarray],
     recordings: Sequence[dict[str, np.ndarray]] = (),
 ) -> None:
-    """Writes a test.
+    """Writes the results of a test to `episodes` in its stage.
 
     Args:
-      stage: whose it is.
-      outcome: of its episodes.
-      trajectories: of the episodes of Fig. 8, `[steps + 1, 3]` each, metres.
-      recordings: of its first episodes: qpos `[steps + 1, nq]` of the robot's visual model,
+      stage: stage of the test.
+      outcome: results of the episodes.
+      trajectories: positions in the episodes of Fig. 8, `[steps + 1, 3]` each, metres.
+      recordings: the first episodes: qpos `[steps + 1, nq]` of the robot's visual model,
         position `[steps + 1, 3]` and target `[3]`, metres.
     """
     tree = {

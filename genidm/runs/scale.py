@@ -1,4 +1,4 @@
-"""How much of the paper's protocol is run."""
+"""Scales: how much of the paper's protocol a run does."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from genidm.agents.ppo import PPO
 from genidm.errors import BadInput
 from genidm.paper import protocol
 
-# Interactions up to which an agent has just begun to learn.
+# Up to this many interactions, an agent still falls early in most episodes.
 YOUNG = 400_000
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """How much of the paper's protocol is run.
+    """How much of the paper's protocol a run does.
 
     Attributes:
-      name: as it stands in paths and results.
-      interactions: steps that are collected.
-      updates: share of a method's updates that are made.
-      seeds: test seeds.
-      episodes: test episodes a seed.
-      goal_horizon: most steps to the intermediate goal. Agents that have just begun to learn
-        (`YOUNG`) fall so soon that few of their episodes reach further.
-      fraction: least part of the record that is learned from: in the first half of a short one
-        the agent hardly walks.
-      learning: least part of the interactions in which an agent that is frozen afterwards
-        learns: with few of them it needs most to learn to walk at all.
-      ppo: stands for PPO at its defaults, whatever its policy's layers, which take their time
-        and fall seldom. With few interactions more has to be made of each.
+      name: name in paths and results.
+      interactions: environment steps to collect.
+      updates: fraction of a method's updates to make.
+      seeds: number of test seeds.
+      episodes: test episodes per seed.
+      goal_horizon: upper limit of a method's `goal_horizon`, steps. With few interactions
+        (`YOUNG`) most episodes end in an early fall, and few are longer.
+      fraction: lower limit of a method's `fraction` of the record: in the first half of a
+        short record the agent hardly walks.
+      learning: lower limit of the fraction of interactions in which an agent learns before it
+        is frozen: with few interactions it needs most of them to learn to walk.
+      ppo: replaces PPO at default settings (policy layers are kept). The defaults learn
+        steadily but slowly; a short run must learn more from each interaction.
     """
 
     name: str
@@ -44,14 +44,14 @@ class Scale:
 
 
 def scale_of(text: str, interactions: int) -> Scale:
-    """What `--scale` names: "paper", "quick", or a share of the paper's numbers.
+    """The scale that `--scale` names: "paper", "quick", or a fraction of the paper's numbers.
 
     Args:
-      text: what the user gave.
-      interactions: the paper's number for the robot.
+      text: value of the flag.
+      interactions: the paper's number of interactions for the robot.
 
     Raises:
-      BadInput: it is none of these.
+      BadInput: `text` is not one of these.
     """
     if text == "paper":
         return Scale("paper", interactions, 1.0, protocol.TEST_SEEDS, protocol.TEST_EPISODES)
@@ -68,7 +68,7 @@ def scale_of(text: str, interactions: int) -> Scale:
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
     interactions = max(1, round(interactions * share))
     return Scale(
-        name=f"{share:g}",  # by its value: 5e-4 is 0.0005
+        name=f"{share:g}",  # equal values get equal names: 5e-4 and 0.0005
         interactions=interactions,
         updates=min(share, 1.0),
         seeds=protocol.TEST_SEEDS,
