@@ -1,4 +1,4 @@
-"""The newest states of a long stage, written by orbax; the one before replaces a corrupt one."""
+"""Checkpoints of a long stage, written by orbax; the last two are kept, in case one is corrupt."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def requested_seconds() -> float:
     """Seconds between checkpoints of a long stage: `GENIDM_CHECKPOINT_SECONDS`, or 60.
 
     Raises:
-      BadInput: it is no number of seconds. Commands say so before they begin.
+      BadInput: the value is not a number of seconds. Commands check this before they begin.
     """
     text = os.environ.get("GENIDM_CHECKPOINT_SECONDS", "").strip() or "60"
     try:
@@ -32,7 +32,7 @@ def requested_seconds() -> float:
     except ValueError:
         seconds = math.nan
     if not seconds >= 0:
-        raise BadInput(f"GENIDM_CHECKPOINT_SECONDS is a number of seconds, not {text!r:.40}")
+        raise BadInput(f"GENIDM_CHECKPOINT_SECONDS must be a number of seconds, not {text!r:.40}")
     return seconds
 
 
@@ -43,17 +43,17 @@ except BadInput:
 
 
 class Checkpoints:
-    """The newest states of a long stage, `directory/step_000000123`, written by orbax.
+    """Checkpoints of a long stage, `directory/step_000000123`, written by orbax.
 
-    Orbax's CheckpointManager would name and keep them, too, but it has no checksum, and it syncs
-    nothing but the arrays: neither what it writes beside them nor the renames.
+    Not orbax's CheckpointManager: it has no checksums, and it syncs only the arrays, neither its
+    other files nor its renames.
 
-    What grows from state to state can lie beside them in parts, `directory/part_NAME`, which are
-    written once: a step names those that it is no use without.
+    Data that only grows is stored in parts, `directory/part_NAME`, which are written once. A
+    checkpoint names the parts that it needs.
 
     Attributes:
-      directory: where they lie.
-      keep: how many steps are kept: two, so that there is one before a corrupt one.
+      directory: directory of the checkpoints.
+      keep: number of checkpoints to keep: two, so that one is left if the other is corrupt.
     """
 
     def __init__(self, directory: Path | str, keep: int = 2):
@@ -61,7 +61,7 @@ class Checkpoints:
         self._saved = time.monotonic()
 
     def due(self) -> bool:
-        """Whether the last save, or the start, is CHECKPOINT_SECONDS ago."""
+        """Whether the last save (or the start) is at least CHECKPOINT_SECONDS ago."""
         return time.monotonic() - self._saved >= CHECKPOINT_SECONDS
 
     def _path(self, step: int) -> Path:
@@ -71,22 +71,21 @@ class Checkpoints:
         return self.directory / f"part_{name}"
 
     def steps(self) -> list[int]:
-        """The steps that are there, oldest first, corrupt ones too."""
+        """The steps on disk, oldest first, including corrupt ones."""
         found = (re.fullmatch(r"step_(\d+)", p.name) for p in self.directory.glob("step_*"))
         return sorted(int(m[1]) for m in found if m)
 
     @files.uninterrupted()
     def save(self, step: int, tree: Any, parts: Sequence[str] = ()) -> None:
-        """Keeps a tree of arrays (on any devices), typed random keys and Python numbers.
+        """Saves a tree of arrays (on any devices), typed random keys and Python numbers.
 
-        Steps are saved in order: one that is there and lies beyond `step` is corrupt, or of a
-        future that a resume has left, and is removed with the old ones, and with the parts that
-        no step names any more.
+        Removes old steps, parts that no step names, and steps later than `step`: these are
+        corrupt, or later than the step that the stage was resumed from.
 
         Args:
-          step: its number.
-          tree: what is kept.
-          parts: names of the parts that belong to it; `save_part` has written them.
+          step: number of the step.
+          tree: the tree to save.
+          parts: names of the parts that the step needs; `save_part` has written them.
         """
         leaves = trees.named(tree)
         keys = {name: str(jax.random.key_impl(x)) for name, x in leaves.items() if files.is_key(x)}
@@ -98,13 +97,13 @@ class Checkpoints:
         }  # fmt: skip
         with files.building(self._path(step)) as scratch:
             files.save_json(scratch / "leaves.json", record)
-            # orbax refuses arrays without elements; their kind is all there is to them.
+            # orbax rejects arrays without elements; `kinds` has their shape and dtype.
             _write(scratch / "tree", {name: x for name, x in arrays.items() if x.size})
         self._saved = time.monotonic()
         self._tidy([s for s in self.steps() if s <= step][-self.keep :])
 
     def _tidy(self, kept: Sequence[int]) -> None:
-        """Removes all steps but these, and the parts that none of them names."""
+        """Removes all other steps, and all parts that the kept steps do not name."""
         with files.disk(self.directory):
             for step in set(self.steps()) - set(kept):
                 files.remove(self._path(step))
@@ -113,31 +112,31 @@ class Checkpoints:
                 files.remove(part)
 
     def save_part(self, name: str, arrays: Mapping[str, Any]) -> None:
-        """Writes a part, before the first step that names it."""
+        """Writes a part; must be called before `save` of the first step that names it."""
         files.save_arrays(self._part(name), arrays, {}, overwrite=True)
 
     def load_part(self, name: str) -> dict[str, np.ndarray]:
-        """A part of a step that `latest` has found whole; its arrays stay on the disk."""
+        """The arrays of a part, memory-mapped; `latest` has verified it."""
         found = self._part(name).glob("*.npy")
         return {file.stem: np.load(file, mmap_mode="r", allow_pickle=False) for file in found}
 
     def parts(self, step: int) -> dict[str, int]:
-        """The parts that a step names, in order, with their checksums; none of a corrupt step."""
+        """Name → checksum of the parts of a step, in order; empty if the step is corrupt."""
         try:
             return files.load_json(self._path(step) / "leaves.json").get("parts", {})
         except files.Corrupt:
             return {}
 
     def latest(self, like: Any) -> tuple[int, Any] | None:
-        """The newest step that is not corrupt, and its tree; None if there is none.
+        """Loads the newest step that is not corrupt; None if there is none.
 
         Args:
-          like: an example of the tree, or of `jax.ShapeDtypeStruct`s: it gives the
+          like: an example of the tree, of arrays or `jax.ShapeDtypeStruct`s: it gives the
             structure, the static fields, and which leaves are Python numbers.
 
         Returns:
-          arrays are NumPy's, random keys lie on the first device: the caller puts them
-          where they belong.
+          the step and its tree. Arrays are NumPy arrays, random keys are on the first device;
+          the caller moves them to their devices.
 
         Raises:
           BadInput: the leaves have other names, shapes or dtypes than those of `like`.
@@ -153,16 +152,18 @@ class Checkpoints:
         return None
 
     def _verify(self, step: int) -> None:
-        """Raises Corrupt unless a step is whole, and so are its parts, as they were."""
+        """Raises Corrupt unless a step and its parts are complete and unchanged."""
         files.verify(self._path(step))
         for name, checksum in self.parts(step).items():
             files.verify(self._part(name))
             if _checksum(self._part(name)) != checksum:
-                raise files.Corrupt(f"{self._part(name)} is not what {self._path(step)} names")
+                raise files.Corrupt(
+                    f"{self._part(name)} is not the part that {self._path(step)} names"
+                )
 
 
 def _checksum(part: Path) -> int:
-    """Of a part's manifest, which has those of its files."""
+    """The checksum of a part's manifest, which contains the checksums of its files."""
     return zlib.crc32((part / files.MANIFEST).read_bytes())
 
 
@@ -171,7 +172,7 @@ def _write(directory: Path, arrays: dict[str, np.ndarray]) -> None:
 
     log = logging.getLogger("absl")
     level = log.level
-    log.setLevel(logging.CRITICAL)  # a full disk is told by us, not by three tracebacks
+    log.setLevel(logging.CRITICAL)  # `disk` reports a full disk; orbax would log three tracebacks
     try:
         if arrays:
             ocp.PyTreeCheckpointer(use_compression=False).save(directory.absolute(), arrays)
@@ -184,7 +185,7 @@ def _restore(path: Path, like: Any) -> Any:
 
     wanted, record = trees.named(like), files.load_json(path / "leaves.json")
     if differs := trees.difference(record["kinds"], trees.kinds(like)):
-        difference = "{} is {} there, {} here".format(*differs)
+        difference = "{} is {} in the checkpoint, {} in this run".format(*differs)
         raise BadInput(f"{path} is a checkpoint of another robot or setting: {difference}")
     tree = (path / "tree").absolute()
     with files.disk(path):
@@ -194,7 +195,7 @@ def _restore(path: Path, like: Any) -> Any:
 
 
 def _leaf(array: Any, key: str | None, like: Any) -> Any:
-    if array is None:  # without elements
+    if array is None:  # an array without elements: orbax did not store it
         return np.zeros(like.shape, like.dtype)
     if key is not None:
         return jax.random.wrap_key_data(array, impl=key)
@@ -202,5 +203,5 @@ def _leaf(array: Any, key: str | None, like: Any) -> Any:
         return type(like)(np.asarray(array).item())
     array = np.asarray(array)
     dtype = getattr(like, "dtype", array.dtype)
-    # By way of a Python number, so that one too large for the dtype is an error.
+    # `item` makes a number that is too large for the dtype an error.
     return array if array.dtype == dtype else np.array(array.item(), dtype)

@@ -1,9 +1,9 @@
-"""Files and directories on disk: whole, or not at all.
+"""Atomic files and directories, with checksums.
 
-Everything is written beside its final name and renamed into place once it is on the disk,
-so that a run killed at any moment leaves the old files or the new ones. Directories carry
-the size and crc32 of each file; one that does not match is corrupt, and is not used. Nothing
-is ever pickled. A full disk, or one that cannot be written, is BadInput everywhere.
+Everything is written under a temporary name, synced, and renamed, so that a kill at any moment
+leaves the old version or the new one. A directory has a manifest with the size and crc32 of each
+file; a directory that does not match is corrupt and is not used. Nothing is pickled. A disk that
+is full or not writable raises BadInput in all functions.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from genidm.errors import BadInput
 MANIFEST = "manifest.json"
 _SCRATCH = ".genidm-tmp"
 _OLD = f".old.*{_SCRATCH}"
-# Seconds after which nobody is still writing what was begun.
+# A temporary file older than this, in seconds, belongs to no running process.
 _ABANDONED = 24 * 3600.0
 
 
@@ -49,13 +49,13 @@ class Corrupt(BadInput):
 
 @contextlib.contextmanager
 def disk(path: Path | str) -> Iterator[None]:
-    """Says in a sentence, as BadInput, why `path` cannot be read or written."""
+    """Turns errors of reading or writing `path` into a one-sentence BadInput."""
     try:
         yield
     except BadInput:
         raise
     except Exception as error:
-        # tensorstore gives a ValueError, and numpy no errno after a short write.
+        # On a full disk tensorstore raises a ValueError, and NumPy an OSError without errno.
         full = re.search("No space left|quota exceeded|requested and .* written", str(error))
         if full or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             raise BadInput(f"no space left on the disk that holds {path}") from error
@@ -66,9 +66,9 @@ def disk(path: Path | str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Holds Ctrl-C back until its end.
+    """Delays Ctrl-C until the end of the block.
 
-    For libraries that write with threads of their own, which say what they think of it.
+    For libraries that write with their own threads, which print tracebacks when interrupted.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -84,7 +84,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def _scratch(path: Path, use: str) -> Path:
-    """A new name beside `path`, for "new", "old" or "gone"; what killed runs left there goes."""
+    """A new temporary name beside `path`, for "new", "old" or "gone"; deletes abandoned ones."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".*{_SCRATCH}"):
         name, old, _ = left.name[1:].rpartition(".old.")
@@ -97,7 +97,7 @@ def _scratch(path: Path, use: str) -> Path:
 
 @functools.cache
 def _here() -> str:
-    """Names the process ids that can be told apart from here: two containers may have one each."""
+    """Identifies the set of process ids: two containers may both have a process 7."""
     parts = [platform.node()]
     with contextlib.suppress(OSError):
         parts.append(Path("/proc/sys/kernel/random/boot_id").read_text())
@@ -106,7 +106,7 @@ def _here() -> str:
 
 
 def _abandoned(left: Path) -> bool:
-    """Whether nobody writes it any more: its process is dead, or it is a day old."""
+    """Whether no process writes `left`: its process has ended, or it is a day old."""
     *_, here, process, _token, _suffix = left.name.split(".")
     try:
         old = time.time() - left.stat().st_mtime > _ABANDONED
@@ -117,7 +117,7 @@ def _abandoned(left: Path) -> bool:
 
 def _alive(process: int) -> bool:
     try:
-        os.kill(process, 0)  # signal 0 only asks
+        os.kill(process, 0)  # signal 0 only tests whether the process exists
     except OSError as error:
         return error.errno != errno.ESRCH
     return True
@@ -131,7 +131,7 @@ def _delete(path: Path) -> None:
 
 
 def _recover(path: Path) -> None:
-    """Brings back the old version of a directory, if a kill has left no new one in its place."""
+    """Restores the old version of a directory if a kill prevented the rename of the new one."""
     if not path.exists():
         for old in path.parent.glob(f".{glob.escape(path.name)}{_OLD}"):
             if _complete(old):
@@ -140,10 +140,10 @@ def _recover(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a directory, if it is there, so that a kill leaves no half of it under its name.
+    """Removes a directory if it exists; a kill never leaves a part of it under its name.
 
     Raises:
-      OSError: it cannot be removed; `disk` around the call says so in a sentence.
+      OSError: it cannot be removed; wrap the call in `disk` for a BadInput.
     """
     if path.exists():
         _delete(path.rename(_scratch(path, "gone")))
@@ -193,22 +193,23 @@ def load_json(path: Path | str) -> Any:
 
 
 def check_writable(path: Path | str, directory: bool = False) -> None:
-    """Refuses a path that cannot be written, before the work that it is for.
+    """Checks that a path can be written, before the work whose results it will hold.
+
+    Existing files stay as they are, and missing directories are not made.
 
     Args:
-      path: a file, or a directory to write files to; what lies there is left as it is, and
-        directories that are missing are not made yet.
-      directory: whether it is one.
+      path: a file, or a directory for files.
+      directory: whether `path` is a directory.
 
     Raises:
-      BadInput: it cannot be written, or is a directory where a file is wanted, or the reverse.
+      BadInput: `path` cannot be written, or is a directory instead of a file or the reverse.
     """
     path = Path(path)
     with disk(path):
         there, missing = (path, "probe") if directory else (path.parent, path.name)
         if not directory and path.is_dir():
             raise BadInput(f"cannot use {path}: it is a directory, not a file")
-        # A link to nothing is there, and is not made by mkdir.
+        # `lexists`: a broken link exists, and mkdir cannot replace it.
         while not (os.path.lexists(there) or there == there.parent):
             there, missing = there.parent, there.name
         if not there.is_dir():
@@ -222,14 +223,14 @@ def check_writable(path: Path | str, directory: bool = False) -> None:
 
 @contextlib.contextmanager
 def building(path: Path) -> Iterator[Path]:
-    """A directory to fill, which then takes the place of `path`, with a manifest.
+    """Yields an empty directory to fill; at the end, adds a manifest and replaces `path` by it.
 
-    An error while it is filled leaves `path` as it was. A kill leaves the old version or the
-    new one: `verify` brings back an old one that was moved away when the kill came.
+    An error in the block leaves `path` unchanged. A kill leaves the old version or the new one:
+    `verify` restores an old version that was already moved away.
 
     Raises:
-      BadInput: the disk is full, `path` cannot be written, or it holds what its manifest does
-        not list.
+      BadInput: the disk is full, `path` cannot be written, or `path` contains files that its
+        manifest does not list.
     """
     with disk(path):
         _recover(path)
@@ -240,7 +241,7 @@ def building(path: Path) -> Iterator[Path]:
             yield scratch
             entries = sorted(scratch.rglob("*"))
             if not entries:
-                raise BadInput(f"{scratch} has vanished while it was written")
+                raise BadInput(f"{scratch} has vanished while it was being written")
             for entry in entries:
                 _sync(entry)
             files = {str(p.relative_to(scratch)): _measure(p) for p in entries if p.is_file()}
@@ -251,7 +252,7 @@ def building(path: Path) -> Iterator[Path]:
 
 
 def _install(scratch: Path, path: Path) -> None:
-    """Puts a directory in the place of another: that is moved away, and deleted afterwards."""
+    """Replaces `path` by `scratch`: moves the old directory away, and deletes it afterwards."""
     if path.exists():
         old = path.rename(_scratch(path, "old"))
         try:
@@ -267,7 +268,7 @@ def _install(scratch: Path, path: Path) -> None:
 
 
 def _only_ours(path: Path) -> None:
-    """Refuses a directory with files that are not in its manifest."""
+    """Raises BadInput if a directory contains files that its manifest does not list."""
     if not path.exists() or not any(path.iterdir()):
         return
     try:
@@ -277,15 +278,15 @@ def _only_ours(path: Path) -> None:
     for file in sorted(path.rglob("*")):
         name = str(file.relative_to(path))
         if file.is_file() and name not in listed and not name.endswith(_SCRATCH):
-            raise BadInput(f"{path} holds something else ({name}), and is not overwritten")
+            raise BadInput(f"{path} holds something else ({name}) and is not overwritten")
 
 
 def _manifest(directory: Path) -> dict[str, list[int]]:
-    """Size and crc32 of each file; raises Corrupt if there is no such list."""
+    """Size and crc32 of each file; raises Corrupt if the manifest is missing or invalid."""
     files = load_json(directory / MANIFEST)
     measures = files.values() if isinstance(files, dict) else [None]
     if not all(isinstance(m, list) and [type(x) for x in m] == [int, int] for m in measures):
-        raise Corrupt(f"{directory / MANIFEST} is no list of files")
+        raise Corrupt(f"{directory / MANIFEST} is not a list of files")
     return files
 
 
@@ -298,7 +299,7 @@ def _measure(file: Path) -> list[int]:
 
 
 def verify(directory: Path | str) -> list[str]:
-    """The files of a complete directory; raises Corrupt if it is not."""
+    """Checks a directory against its manifest and returns its files; raises Corrupt."""
     directory = Path(directory)
     with disk(directory):
         _recover(directory)
@@ -324,17 +325,17 @@ def save_arrays(path: Path | str, tree: Any, meta: Any, overwrite: bool = False)
     """Writes arrays as a directory of .npy files.
 
     Args:
-      path: the directory; a corrupt one there is replaced.
+      path: the directory; a corrupt one is replaced.
       tree: nested dicts of arrays; `{"a": {"b": x}}` becomes `a.b.npy`.
-      meta: what JSON can hold (see `to_json`), kept beside them.
-      overwrite: replace a complete directory, too.
+      meta: metadata for `meta.json`; any value that `to_json` accepts.
+      overwrite: also replace a complete directory.
 
     Raises:
-      BadInput: `path` is complete already, or a name or an array cannot be kept.
+      BadInput: `path` is complete already, or a name or an array cannot be stored.
     """
     path, arrays = Path(path), {name: as_array(name, x) for name, x in _dotted(tree)}
     if not overwrite and _complete(path):
-        raise BadInput(f"{path} is there already, and is not overwritten")
+        raise BadInput(f"{path} exists already and is not overwritten")
     with building(path) as scratch:
         for name, array in arrays.items():
             np.save(scratch / f"{name}.npy", array, allow_pickle=False)
@@ -342,15 +343,15 @@ def save_arrays(path: Path | str, tree: Any, meta: Any, overwrite: bool = False)
 
 
 def load_arrays(path: Path | str, mmap: bool = False) -> tuple[dict[str, Any], Any]:
-    """What `save_arrays` wrote: `(tree, meta)`.
+    """Reads what `save_arrays` wrote: `(tree, meta)`.
 
     Args:
       path: the directory.
-      mmap: leave the arrays on the disk, read-only, and read what is looked at.
+      mmap: memory-map the arrays, read-only, instead of reading them.
 
     Raises:
       Corrupt: a file is missing, cut short or changed.
-      BadInput: a file holds pickled objects.
+      BadInput: a file contains pickled objects or is not a valid array.
     """
     path, tree = Path(path), dict[str, Any]()
     for file in verify(path):
@@ -359,13 +360,13 @@ def load_arrays(path: Path | str, mmap: bool = False) -> tuple[dict[str, Any], A
         *parents, name = file.removesuffix(".npy").split(".")
         node: dict[str, Any] = functools.reduce(lambda d, k: d.setdefault(k, {}), parents, tree)
         if not isinstance(node, dict) or name in node:
-            raise BadInput(f"{path} is no tree of arrays: {file} lies inside another array")
+            raise BadInput(f"{path} is not a tree of arrays: {file} is named like part of an array")
         node[name] = _read(path / file, mmap)
     return tree, load_json(path / "meta.json")
 
 
 def _read(file: Path, mmap: bool) -> np.ndarray:
-    """An array, once its header says no more than there is: it may claim any number of bytes."""
+    """Reads an array after checking its header: a corrupt one may claim any number of bytes."""
     try:
         with file.open("rb") as f:
             version = np.lib.format.read_magic(f)
@@ -381,7 +382,7 @@ def _read(file: Path, mmap: bool) -> np.ndarray:
         array: np.ndarray = np.load(file, mmap_mode="r" if mmap else None, allow_pickle=False)
     except OSError:
         raise
-    except Exception as error:  # what NumPy's parser raises for a header that is none varies
+    except Exception as error:  # NumPy's parser raises various errors for an invalid header
         raise BadInput(f"{file} cannot be read: {shown(error)}") from None
     return array
 
@@ -389,7 +390,7 @@ def _read(file: Path, mmap: bool) -> np.ndarray:
 def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in tree.items():
         if not isinstance(key, str) or not re.fullmatch(r"[\w-]+", key):
-            raise BadInput(f"{key!r} cannot name an array: letters, digits, _ and - can")
+            raise BadInput(f"{key!r} cannot name an array: use only letters, digits, _ and -")
         if isinstance(value, Mapping):
             yield from _dotted(value, f"{prefix}{key}.")
         else:
@@ -397,20 +398,20 @@ def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def as_array(name: str, x: Any) -> np.ndarray:
-    """`x` as NumPy's, of any shape and dtype that can be kept without pickle.
+    """Converts `x` to a NumPy array of a dtype that can be stored without pickle.
 
     Args:
-      name: what an error calls it.
-      x: an array, or a number.
+      name: name of `x` in error messages.
+      x: an array of any shape, or a number.
 
     Raises:
-      BadInput: it holds objects, text or typed random keys.
+      BadInput: `x` contains objects, text or typed random keys.
     """
     if is_key(x):
-        raise BadInput(f"{name} holds typed random keys: keep jax.random.key_data of them")
+        raise BadInput(f"{name} holds typed random keys: store jax.random.key_data of them")
     array = np.asarray(x)
     if array.dtype.kind not in "biufc":
-        raise BadInput(f"{name} cannot be kept without pickle: its dtype is {array.dtype}")
+        raise BadInput(f"{name} cannot be stored without pickle: its dtype is {array.dtype}")
     return array
 
 

@@ -1,7 +1,7 @@
-"""How far a stage is: a bar with rate and time left, metrics as JSONL and TensorBoard.
+"""Progress of a stage: a bar with rate and remaining time, metrics as JSONL and TensorBoard.
 
-`metrics.jsonl` is the record; TensorBoard's files are written from it anew when a stage is
-resumed, so that neither shows a part of a curve twice.
+`metrics.jsonl` is the source. When a stage is resumed, its lines after the checkpoint are dropped
+and TensorBoard's files are rewritten from it, so that no part of a curve appears twice.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from genidm.errors import BadInput
 from genidm.files import disk, save_text
 
 METRICS = "metrics.jsonl"
-# tensorboardX waits for the disk at each flush, so that happens every so many seconds.
+# Seconds between flushes: tensorboardX waits for the disk at each flush.
 FLUSH_SECONDS = 5.0
 
 
 def compile_ahead(name: str, jitted: Any, *args: Any) -> Callable[..., Any]:
-    """Compiles a jitted function ahead of its first call, and says how long that took.
+    """Compiles a jitted function before its first call, and prints the time on stderr.
 
-    One that lies in the compilation cache is only traced anew, and read.
+    A program in the compilation cache is only traced and read.
 
     Args:
-      name: what the function is, for the line on stderr.
-      jitted: what `jax.jit` returned.
-      args: its arguments, or `jax.ShapeDtypeStruct`s with shardings in their place.
+      name: name of the function in the printed line.
+      jitted: result of `jax.jit`.
+      args: arguments, or `jax.ShapeDtypeStruct`s with shardings in their place.
 
     Returns:
-      the compiled program; it takes arguments of these shapes, dtypes and shardings, less
+      the compiled program; it takes arguments of these shapes, dtypes and shardings, without
       the static ones.
     """
     start = time.perf_counter()
@@ -58,8 +58,8 @@ class Progress:
             progress.advance(4096, reward=reward)
 
     Attributes:
-      name: what is going on, in front of the bar.
-      done: units done, those before a resume included.
+      name: label in front of the bar.
+      done: units done, including those before a resume.
     """
 
     def __init__(
@@ -74,11 +74,11 @@ class Progress:
         """Starts the bar.
 
         Args:
-          name: what is going on, in front of the bar.
-          total: units in all.
-          unit: what is counted, for the rate.
-          directory: where `metrics.jsonl` and TensorBoard's files go; None: nowhere. One
-            stage a directory: what it holds beyond `initial` is dropped.
+          name: label in front of the bar.
+          total: total number of units.
+          unit: name of the unit, for the rate.
+          directory: directory for `metrics.jsonl` and TensorBoard's files, of this stage alone;
+            metrics there after step `initial` are dropped. None: write no files.
           initial: units done before a resume.
           quiet: show no bar.
 
@@ -95,14 +95,14 @@ class Progress:
             unit=f" {unit}",
             unit_scale=True,
             dynamic_ncols=True,
-            mininterval=0.2 if live else 10.0,  # a log file gets a line now and then
-            miniters=0,  # metrics may tell more than units do
+            mininterval=0.2 if live else 10.0,  # seconds; a log file needs few lines
+            miniters=0,  # show new metrics even if few units are done
             disable=quiet,
             file=sys.stderr,
         )
 
     def advance(self, n: int, /, **metrics: Any) -> None:
-        """Counts `n` more units, and records metrics (numbers, or arrays of one) if any.
+        """Counts `n` more units, and records metrics (numbers, or arrays of one element).
 
         Metrics that are not finite are `null` in the JSONL and absent from TensorBoard.
 
@@ -169,10 +169,10 @@ class _Curves:
 
 
 def _events(directory: Path) -> Any:
-    """A fresh event file, in place of those there.
+    """Deletes the event files of a directory and opens a new one.
 
-    Not tensorboardX's SummaryWriter: that writes in a thread, which dies silently on a
-    full disk and then blocks its caller for ever.
+    Not tensorboardX's SummaryWriter: its thread dies silently on a full disk, and then blocks
+    the caller for ever.
     """
     from tensorboardX.event_file_writer import EventsWriter
 
@@ -187,7 +187,7 @@ def _number(x: Any) -> float | int | None:
 
 
 def read_metrics(path: Path | str) -> list[dict[str, Any]]:
-    """The lines of a `metrics.jsonl`: `step`, `time` (seconds since 1970) and the metrics.
+    """Reads a `metrics.jsonl`: each line has `step`, `time` (seconds since 1970) and metrics.
 
     A last line that was cut short is left out.
 

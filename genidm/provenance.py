@@ -1,11 +1,11 @@
 """What made a result: the code it depends on, the commit, versions, machine and command.
 
-A stage depends on code through `code_of`: the modules of genidm that its settings, its robot,
-its engine and its own function import, one through another. A module counts by its syntax tree
-without docstrings and comments, so that an edit of prose changes nothing. Not counted are
+`code_of` finds the code of a stage: the modules of genidm that its settings, robot, engine and
+own function import, directly or through other modules. A module's digest is of its syntax tree
+without docstrings and comments, so an edit of these changes nothing. Two kinds are not counted:
 
-- `UNRELATED`: modules that show, check, name or store results, and do not make them;
-- packages' `__init__`, which list what is there: a new robot does not change the Ant's results.
+- `UNRELATED`: modules that show, check, name or store results, and do not compute them;
+- the `__init__` of packages, which only lists names: a new robot must not change the Ant's digest.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def code_of(*roots: Any) -> dict[str, str]:
     """The modules that a result depends on: name → ten hex digits of its code.
 
     Args:
-      roots: names of modules, or objects: of these the modules that define their classes count,
-        and those of all dataclasses inside them.
+      roots: names of modules, or objects. An object stands for the modules that define its
+        class and the classes of all dataclasses in it.
     """
     found: dict[str, str] = {}
     todo = {name for root in roots for name in _modules_of(root)}
@@ -63,13 +63,13 @@ def code_of(*roots: Any) -> dict[str, str]:
 
 
 def code_digest(code: Mapping[str, str]) -> str:
-    """Ten hex digits that stand for all modules of `code_of`."""
+    """One digest, ten hex digits, of all modules of `code_of`."""
     text = "\n".join(f"{name} {digest}" for name, digest in sorted(code.items()))
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Modules that two results do not have in common, or have in two versions."""
+    """Modules that only one of two results has, or whose digests differ."""
     return sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
 
 
@@ -84,26 +84,26 @@ def _modules_of(root: Any) -> Iterator[str]:
         yield from _defined_in(type(root))
         for field in dataclasses.fields(root):
             value = getattr(root, field.name)
-            if not isinstance(value, str):  # a word, and no module
+            if not isinstance(value, str):  # a field's text is a setting, not a module
                 yield from _modules_of(value)
     elif not isinstance(root, bool | int | float | None):
         yield from _defined_in(type(root))
 
 
 def _defined_in(kind: type) -> Iterator[str]:
-    """The modules of a class and of those that it inherits from."""
+    """The modules of a class and of its base classes."""
     yield from (base.__module__ for base in kind.__mro__)
 
 
 @functools.cache
 def _tree(name: str) -> ast.Module | None:
-    """The syntax tree of a module; None of what is no module of ours or the user's."""
+    """The syntax tree of a module of genidm or of the user; None of other modules."""
     path = _path(name)
     return ast.parse(path.read_text(encoding="utf-8")) if path else None
 
 
 def _path(name: str) -> Path | None:
-    """The file of a module; None of packages, of what Python or others bring, and of notebooks."""
+    """The file of a module; None for packages, Python's and installed modules, and notebooks."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     if module is None and (name == "genidm" or name.startswith("genidm.")):
@@ -128,7 +128,7 @@ def _digest(name: str) -> str:
 
 
 def _is_text(node: ast.AST) -> bool:
-    """Whether a statement is a docstring, of whatever."""
+    """Whether a statement is a docstring, also of an attribute."""
     return (
         isinstance(node, ast.Expr)
         and isinstance(node.value, ast.Constant)
@@ -151,11 +151,11 @@ def _imported(name: str) -> tuple[str, ...]:
 
 @functools.cache
 def environment() -> dict[str, Any]:
-    """Where a result is made.
+    """The versions, machine and commit that make results here.
 
     Returns:
-      `versions` of packages (None where absent), `hardware` in a line, git `commit` (None
-      outside of a clone) and whether the tree was `clean`.
+      `versions` of packages (None if not installed), `hardware` in one line, git `commit` and
+      whether its tree is `clean` (both None outside a clone).
     """
     versions: dict[str, str | None] = {"python": platform.python_version()}
     for package in PACKAGES:
@@ -174,7 +174,7 @@ def environment() -> dict[str, Any]:
 
 
 def command() -> str:
-    """The command line of this process, as it can be given again."""
+    """The command line of this process, quoted for a shell."""
     name = getattr(getattr(sys.modules["__main__"], "__spec__", None), "name", None)
     program = ["python", "-m", name.removesuffix(".__main__")] if name else sys.argv[:1]
     return shlex.join([*program, *sys.argv[1:]])
@@ -188,11 +188,11 @@ def _machine() -> str:
 
 
 def _commit() -> tuple[str | None, bool | None]:
-    """The commit of the clone that this package lies in, and whether nothing is changed there."""
+    """The commit of the clone that contains this package, and whether its tree is clean."""
     git = ["git", "-C", str(_PACKAGE)]
     try:
         top, commit = _lines([*git, "rev-parse", "--show-toplevel", "HEAD"])[:2]
-        # Not the commit of a repository that happens to lie around an installed package.
+        # An installed package may lie inside an unrelated repository.
         if Path(top) != _PACKAGE.parent:
             return None, None
         return commit, not _lines([*git, "status", "--porcelain"])

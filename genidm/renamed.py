@@ -1,4 +1,4 @@
-"""Flags that have another name now: a command that is given an old one says the new one."""
+"""Renamed flags: a command that gets an old flag names the new one in its error message."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ RENAMED = {
     **{f"--method.agent.{old}": f"--method.agent.{new}" for old, new in _AGENT.items()},
     **{f"--method.agent.agent.{old}": f"--method.agent.agent.{new}" for old, new in _AGENT.items()},
 }
-"""Old flag → new flag. A switch is turned off by both with `no-` before the last word."""
+"""Old flag → new flag. Both turn a switch off with `no-` before the last word."""
 
 
 def refuse(command: Callable[..., Any], arguments: Sequence[str]) -> None:
-    """Refuses flags that are called otherwise now, unless the command has a flag of that name.
+    """Raises BadInput for a renamed flag, unless the command has a flag of the old name.
 
     Args:
-      command: what the flags are parsed for, by tyro.
+      command: the function whose flags tyro parses.
       arguments: the command line, without the program.
 
     Raises:
-      BadInput: one is an old flag; the message names the new one.
+      BadInput: an argument is an old flag; the message names the new flag.
     """
     names = set(_names(command))
     for argument in arguments:
@@ -77,11 +77,11 @@ def refuse(command: Callable[..., Any], arguments: Sequence[str]) -> None:
             continue
         new = RENAMED[old]
         if "." in new or new[2:] in names:
-            raise BadInput(f"{flag} is called {_with_no(new) if old != flag else new} now")
+            raise BadInput(f"{flag} is now called {_with_no(new) if old != flag else new}")
 
 
 def _names(command: Callable[..., Any]) -> Iterator[str]:
-    """The flags of a command, without dashes and without those below a dot."""
+    """The top-level flags of a command, without dashes."""
     for parameter in inspect.signature(command).parameters.values():
         yield parameter.name.replace("_", "-")
         if dataclasses.is_dataclass(parameter.default):

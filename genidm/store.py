@@ -1,4 +1,4 @@
-"""Run directories: one a stage, named by its config and its code, found again and resumed."""
+"""Stages of a run: one directory each, named by its config and code; finished or resumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from genidm.provenance import changed, code_digest, command, environment
 
 T = TypeVar("T")
 
-# Windows has no such locks: there nobody waits for another process.
+# Windows has no `fcntl`: there, processes do not wait for each other.
 fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
 
 CONFIG, MADE, DONE = "config.json", "made.json", "done.json"
@@ -29,10 +29,11 @@ CONFIG, MADE, DONE = "config.json", "made.json", "done.json"
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """One part of a run, in a directory that its config and its code name.
+    """One part of a run, in a directory whose name contains a hash of its config and code.
 
-    The directory holds `config.json` (config, and the code of each module), `made.json` (which
-    commands worked on it, where, and for how long) and, once it is finished, `done.json`.
+    The directory contains `config.json` (the config, and a digest of each module's code),
+    `made.json` (the commands that worked on it, their machines and times) and, when the stage is
+    finished, `done.json` (its summary).
 
     Attributes:
       directory: `root/name-<digest of config and code>`.
@@ -49,17 +50,17 @@ class Stage:
         code: Mapping[str, str] | None = None,
         reuse: bool = False,
     ) -> Stage:
-        """Finds the stage, or makes its directory.
+        """Opens the stage of a config and code, and makes its directory if it is missing.
 
-        A finished stage of the same config that other code made is not taken for it: it says
-        on stderr which modules differ, and the stage is made anew.
+        If a finished stage has the same config but other code, this prints on stderr which
+        modules differ, and returns the stage of this code (with `reuse`, the finished stage).
 
         Args:
-          root: where stages lie.
+          root: directory that contains the stages.
           name: first words of the directory's name.
-          config: what tells the stage from others.
+          config: settings of the stage; different settings make different stages.
           code: module → digest of the code that the stage runs (`provenance.code_of`).
-          reuse: take a finished stage that other code made, and say so.
+          reuse: use a finished stage that other code made, with a warning.
         """
         code = dict(code or {})
         key = {"config": config, "code": code_digest(code)} if code else config
@@ -76,7 +77,7 @@ class Stage:
         return stage
 
     def _of_other_code(self, name: str, config: Any, code: Mapping[str, str]) -> Stage | None:
-        """The newest finished stage of the same config that other code made."""
+        """The newest finished stage with the same config and other code."""
         wanted, found = to_json(config), []
         for path in self.directory.parent.glob(f"{name}-*/{DONE}"):
             other = Stage(path.parent)
@@ -94,10 +95,10 @@ class Stage:
 
     @property
     def made(self) -> list[dict[str, Any]]:
-        """Which commands have worked on the stage, oldest first.
+        """The commands that worked on the stage, oldest first.
 
-        Each with its command, commit, clean, versions, hardware, and start and seconds: when it
-        began, in seconds since 1970, and for how long it worked (None of one that was killed).
+        Each has command, commit, clean, versions, hardware, start (seconds since 1970) and
+        seconds (duration; None if the command was killed).
         """
         path = self.path(MADE)
         sessions: list[dict[str, Any]] = load_json(path) if path.exists() else []
@@ -112,7 +113,7 @@ class Stage:
             return False
 
     def summary(self) -> Any:
-        """What `finish` was given; raises Corrupt if the stage is not finished."""
+        """The summary given to `finish`; raises Corrupt if the stage is not finished."""
         try:
             return load_json(self.path(DONE))
         except Corrupt as corrupt:
@@ -121,10 +122,10 @@ class Stage:
             ) from None
 
     def run_once(self, work: Callable[[], dict[str, Any]]) -> None:
-        """Does the stage, unless it is done; `work` returns its summary.
+        """Calls `work` and finishes the stage with the summary it returns, unless it is done.
 
-        Where several processes come to one stage, one does it and the others wait. One that
-        dies gives the stage free, however it dies.
+        If several processes open one stage, one works and the others wait. The lock ends with
+        its process, also if the process is killed.
         """
         if self.done:
             return
@@ -137,14 +138,14 @@ class Stage:
                 self.clear_checkpoints()
 
     def _begin(self) -> float:
-        """Writes down who begins to work; says so where a part of the work is another machine's."""
+        """Records this command in `made.json`; warns if another environment began the stage."""
         sessions, here = self.made, environment()
         if sessions and self.path("checkpoints").exists():
             before = sessions[-1]
             other = ", ".join(f"{k} {before.get(k)}" for k in here if before.get(k) != here[k])
             if other:
-                change = f"{self.directory} was begun elsewhere ({other})"
-                print(f"warning: {change}; bits may differ from one machine's", file=sys.stderr)
+                begun = f"{self.directory} was begun in another environment ({other})"
+                print(f"warning: {begun}; bits may differ", file=sys.stderr)
         start = round(time.time(), 3)
         now = {"command": command(), **here, "start": start, "seconds": None}
         save_json(self.path(MADE), [*sessions, now])
@@ -155,15 +156,15 @@ class Stage:
         save_json(self.path(MADE), [*before, now | {"seconds": round(time.time() - begun, 1)}])
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Marks the stage as finished; the last thing done to it."""
+        """Marks the stage as finished; must be the last write to it."""
         save_json(self.path(DONE), summary)
 
     def read(self, load: Callable[..., T], name: str, *args: Any) -> T:
-        """`load(self.path(name), *args)`, of a stage that is finished or goes on.
+        """Returns `load(self.path(name), *args)`.
 
         Raises:
-          Corrupt: it is corrupt; the message says which directory to delete, for until then the
-            stage stays as it is.
+          Corrupt: the file or directory is corrupt. The message says which directory to delete;
+            the stage is not made again before that.
         """
         try:
             return load(self.path(name), *args)
@@ -173,15 +174,15 @@ class Stage:
         raise Corrupt(said if delete in said else f"{said}. {delete}")
 
     def path(self, name: str) -> Path:
-        """Where the stage keeps the file or directory `name`."""
+        """Path of the file or directory `name` of the stage."""
         return self.directory / name
 
     def checkpoints(self, part: str = "") -> Checkpoints:
-        """Its checkpoints, while it is under way; `part` names those of one kind."""
+        """The checkpoints of an unfinished stage; `part` names a kind of them."""
         return Checkpoints(self.path("checkpoints") / part)
 
     def clear_checkpoints(self) -> None:
-        """Removes them."""
+        """Removes all checkpoints."""
         with disk(self.directory):
             remove(self.path("checkpoints"))
 
@@ -201,7 +202,7 @@ def _differs(other: Stage, code: Mapping[str, str]) -> str:
 
 @contextlib.contextmanager
 def alone(directory: Path) -> Iterator[None]:
-    """Holds the lock of a directory; goes without where the file system has none."""
+    """Holds the lock of a directory, or no lock if the file system has none."""
     if fcntl is None:
         yield
         return
@@ -211,7 +212,7 @@ def alone(directory: Path) -> Iterator[None]:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                print(f"waiting for another process, at work in {directory}", file=sys.stderr)
+                print(f"waiting for another process that works in {directory}", file=sys.stderr)
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
     finally:

@@ -101,7 +101,7 @@ def test_the_humanoids_rows_on_a_point(small, monkeypatch):
 
 
 def test_a_robot_without_rows_and_the_place_of_the_others(ant):
-    with pytest.raises(BadInput, match="rows for ant and humanoid, not for point"):
+    with pytest.raises(BadInput, match="rows for robots with a MuJoCo model"):
         command.benchmark(Point(), Options())
     assert command.place(ant, Options()) == Path("experiments/results/ant_benchmark.json")
 
@@ -251,7 +251,7 @@ def test_bad_input_is_one_sentence(arguments, said, monkeypatch, capsys):
 
 
 def test_a_robot_without_a_model_has_no_rows():
-    with pytest.raises(BadInput, match="rows for robots with a MuJoCo model, not for the point"):
+    with pytest.raises(BadInput, match="rows for robots with a MuJoCo model, not for point"):
         command.benchmark(Point(), Options(out=Path("nowhere.json")))
 
 

@@ -114,11 +114,26 @@ def test_the_class_of_a_container_does_not_matter(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("like", "difference"),
     [
-        ({"a": np.ones((3, 4), np.float32)}, r"a is float32\[2, 4\] there, float32\[3, 4\] here"),
-        ({"a": np.ones((2, 4), np.int32)}, r"a is float32\[2, 4\] there, int32\[2, 4\] here"),
-        ({"b": np.ones((2, 4), np.float32)}, r"a is float32\[2, 4\] there, absent here"),
-        ({"a": {"b": np.ones((2, 4), np.float32)}}, r"a is float32\[2, 4\] there, absent here"),
-        ({"a": np.ones((2, 4), np.float32), "b": 1}, r"b is absent there, int here"),
+        (
+            {"a": np.ones((3, 4), np.float32)},
+            r"a is float32\[2, 4\] in the checkpoint, float32\[3, 4\] in this run",
+        ),
+        (
+            {"a": np.ones((2, 4), np.int32)},
+            r"a is float32\[2, 4\] in the checkpoint, int32\[2, 4\] in this run",
+        ),
+        (
+            {"b": np.ones((2, 4), np.float32)},
+            r"a is float32\[2, 4\] in the checkpoint, absent in this run",
+        ),
+        (
+            {"a": {"b": np.ones((2, 4), np.float32)}},
+            r"a is float32\[2, 4\] in the checkpoint, absent in this run",
+        ),
+        (
+            {"a": np.ones((2, 4), np.float32), "b": 1},
+            r"b is absent in the checkpoint, int in this run",
+        ),
     ],
 )
 def test_a_checkpoint_of_another_robot_is_refused(tmp_path: Path, like, difference: str) -> None:

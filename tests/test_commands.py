@@ -131,9 +131,8 @@ def test_who_has_set_what_is_known(monkeypatch, tmp_path: Path) -> None:
     chosen, given, papers = ran[0].notes
     assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
     assert given == "LR, set by you: fit.batch_size 64 (512)"
-    assert papers.startswith(
-        "LR, unlike the paper (see --paper-settings): fit.mean_latent False (True)"
-    )
+    assert papers.startswith("LR, unlike the paper (see --paper-settings): fit.")
+    assert "fit.mean_latent False (True)" in papers
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 10**30, 1.5])

@@ -197,7 +197,7 @@ def test_a_call_tries_measures_and_runs_cells_once(monkeypatch, tmp_path, starte
     assert all(row["done"] for row in found["stages"])
     assert found["calls"][0]["ended"] == "done: point LR"
     out = capsys.readouterr().out
-    assert "| point | LR | its own | 0.25 |" in out and "goes on from here" in out
+    assert "| point | LR | its own | 0.25 |" in out and "again to resume" in out
     assert (tmp_path / "runs" / "point" / "report-0.25" / "table.txt").exists()
     assert run(monkeypatch, tmp_path, "--methods", "LR") == 0
     assert started == once | {"look": 2}
@@ -250,7 +250,7 @@ def test_a_call_stops_at_its_time_limit_and_says_how_far_it_is(
     (row,) = section(tmp_path)["stages"]
     assert row["step"] == 512 and 6.0 < row["seconds"] < 9.0 and "began" not in row
     said = capsys.readouterr()
-    assert "point LR is collecting at step 512. The same command goes on" in said.out
+    assert "point LR is collecting at step 512. Run the same command again" in said.out
     assert "point HF cell on its own: no time is left for it" in said.err
 
 

@@ -247,7 +247,7 @@ def test_what_no_number_stands_for_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="a holds NaN"):
         dataclasses.replace(log(), a=with_("a", (3, 1), np.nan)).save(tmp_path / "log")
     log().save(tmp_path / "log")
-    with pytest.raises(BadInput, match="there already"):
+    with pytest.raises(BadInput, match="exists already"):
         log().save(tmp_path / "log")
 
 

@@ -69,7 +69,7 @@ def test_an_old_flag_is_refused_where_the_new_one_is_taken(old: str) -> None:
     assert commands, f"no command takes {new}"
     for command in commands:
         for argument in (old, f"{old}=3", old.replace("-", "_").replace("__", "--", 1)):
-            with pytest.raises(BadInput, match=rf"^{old} is called {new} now$"):
+            with pytest.raises(BadInput, match=rf"^{old} is now called {new}$"):
                 refuse(command, ["--seed", "1", argument])
         refuse(command, [new, "3"])
 
@@ -86,7 +86,7 @@ def test_a_switch_is_turned_off_by_its_new_name() -> None:
         ("--no-literal", "--no-paper-settings"),
     ):
         assert new in flags(0)
-        with pytest.raises(BadInput, match=rf"^{old} is called {new} now$"):
+        with pytest.raises(BadInput, match=rf"^{old} is now called {new}$"):
             refuse(COMMANDS[0], [old])
 
 
@@ -100,4 +100,4 @@ def test_the_command_line_ends_in_a_sentence(monkeypatch, capsys, tmp_path: Path
     with pytest.raises(SystemExit) as ended:
         run_cli(table1, "")
     assert ended.value.code == 2
-    assert capsys.readouterr().err == "error: --out is called --run-dir now\n"
+    assert capsys.readouterr().err == "error: --out is now called --run-dir\n"

@@ -165,7 +165,7 @@ def test_a_stage_that_another_process_does_is_waited_for(tmp_path: Path, other, 
     waiting.start()
     waiting.join(1)
     assert waiting.is_alive() and not calls
-    assert f"waiting for another process, at work in {stage.directory}" in capfd.readouterr().err
+    assert f"waiting for another process that works in {stage.directory}" in capfd.readouterr().err
     other.communicate(b"end\n")
     waiting.join(20)
     assert not waiting.is_alive() and not calls

@@ -20,19 +20,21 @@ from genidm.runs.command import run_cli
 
 
 def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
-    """Measures the rows, and writes them.
+    """Measures the rows and writes them.
 
     Raises:
-      BadInput: unknown rows, lanes that the devices cannot share, a run that is none, or a
-        place that cannot be written.
+      BadInput: a row is unknown, the devices cannot share the lanes equally, the run is
+        invalid, or the file cannot be written.
     """
     if robot.name not in ROWS and not isinstance(robot, MujocoRobot):
-        raise BadInput(f"there are rows for robots with a MuJoCo model, not for the {robot.name}")
+        raise BadInput(
+            f"the benchmark has rows for robots with a MuJoCo model, not for {robot.name}"
+        )
     rows, out = choose(options.rows, ROWS.get(robot.name, OTHERS)), place(robot, options)
     for lanes in (options.num_envs, options.wide):
         if lanes % robot.mesh().size:
             raise BadInput(f"{lanes} lanes cannot be shared among {robot.mesh().size} devices")
-    with files.disk(out):  # before the measuring, not after it
+    with files.disk(out):  # a bad path must fail before the measurement
         if out.is_dir():
             raise BadInput(f"{out} is a directory")
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +48,7 @@ def benchmark(robot: Robot, options: Options) -> list[dict[str, Any]]:
 
 
 def place(robot: Robot, options: Options) -> Path:
-    """Where the rows are written."""
+    """Path of the JSON file of the rows."""
     return Path(options.out or f"experiments/results/{robot.name}_benchmark.json")
 
 
@@ -58,7 +60,7 @@ def main() -> None:
     ) -> None:
         print(table(benchmark(by_name(options.robot, options.engine), options)))
 
-    run_cli(command, "How fast everything is, as ratios to what limits it.")
+    run_cli(command, "Measures the speed of every part, with its ratio to a limit or a reference.")
 
 
 if __name__ == "__main__":

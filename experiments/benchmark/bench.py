@@ -1,4 +1,4 @@
-"""What rows share: the robot, the sizes, and what is made once for several of them."""
+"""What rows share: the robot, the sizes, and objects that are made once for several rows."""
 
 from __future__ import annotations
 
@@ -23,22 +23,21 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is measured, and for how long.
+    """Options of the benchmark.
 
     Attributes:
-      robot: by its name.
-      engine: steps the robot; the robot chooses, unless given. The rows of raw stepping measure
-        every engine in any case.
-      out: where the rows are written, as JSON; experiments/results/ROBOT_benchmark.json,
-        unless given.
-      run: the finished fit stage whose controller is evaluated; an untrained one, unless
-        given. It decides how long episodes are, and with that the useful share.
-      rows: only the rows of these names, or of which these are a part, and those that they
-        are compared with; the file then holds no others.
-      seconds: of measuring, for each row.
-      num_envs: robots at once in the rows of collecting.
-      wide: robots at once in the rows of 𝒢 and evaluation.
-      scenarios: test seeds, and episodes for each of them, of the useful share of evaluation.
+      robot: name of the robot.
+      engine: engine that steps the robot; default: the robot's choice. The rows of raw stepping
+        measure every engine in any case.
+      out: JSON file of the rows; default: experiments/results/ROBOT_benchmark.json.
+      run: directory of a finished fit, whose controller is evaluated; default: an untrained
+        controller. It determines the length of episodes, and so the share of useful steps.
+      rows: names, or parts of names, of the rows to measure; the rows that these are compared
+        with are added. The file contains no other rows. Default: all.
+      seconds: measuring time of each row.
+      num_envs: lanes in the rows of collecting.
+      wide: lanes in the rows of 𝒢 and evaluation.
+      scenarios: number of test seeds, and of episodes per seed, in the rows of useful steps.
     """
 
     robot: str = "ant"
@@ -60,12 +59,12 @@ class Options:
 
 @dataclasses.dataclass
 class Bench:
-    """Where rows are measured.
+    """The state that all rows share.
 
     Attributes:
-      robot: whose physics is stepped.
-      options: sizes.
-      exits: what is to be closed at the end.
+      robot: the robot to step.
+      options: sizes and times.
+      exits: closes resources at the end.
     """
 
     robot: Robot
@@ -74,26 +73,26 @@ class Bench:
     _made: dict[Callable[[Bench], Any], Any] = dataclasses.field(default_factory=dict)
 
     def once(self, make: Callable[[Bench], T]) -> T:
-        """What `make` makes of this bench, made when it is first asked for."""
+        """Returns `make(self)`; calls `make` only the first time."""
         if make not in self._made:
             self._made[make] = make(self)
         return self._made[make]
 
     def num_envs(self, wide: bool) -> int:
-        """Robots at once: as in 𝒢 and evaluation, or as in collecting."""
+        """Number of lanes: that of 𝒢 and evaluation if `wide`, else that of collecting."""
         return self.options.wide if wide else self.options.num_envs
 
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """The devices that share the robot's lanes."""
+        """The devices that share the lanes."""
         return self.robot.mesh()
 
     @functools.cached_property
     def scratch(self) -> Path:
-        """A directory that is removed at the end."""
+        """A temporary directory, removed at the end."""
         return Path(self.exits.enter_context(tempfile.TemporaryDirectory(prefix="genidm-")))
 
 
 def counted(n: int, what: str) -> str:
-    """A number of things, in words: "1 lane", "8 lanes"."""
+    """A number with its noun: "1 lane", "8 lanes"."""
     return f"{n} {what}{'s' if n > 1 else ''}"

@@ -1,4 +1,4 @@
-"""Collecting: agents that learn and are recorded, and the record's way to the disk."""
+"""Rows of collecting: agents that learn and record, and writing the record to disk."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from genidm.tasks import Transition
 
 
 def segment(bench: Bench) -> int:
-    """Steps of a segment of 𝒢, on the robot's engine."""
+    """Length of 𝒢's segments on the robot's engine, steps."""
     settings = LR.generalize and LR.generalize.on(bench.robot)
     assert settings and settings.segment
     return settings.segment
 
 
 def record(bench: Bench) -> Experience:
-    """Random actions, long enough for four blocks of 𝒢."""
+    """A record of random actions, long enough for four blocks of 𝒢."""
     interactions = 4 * bench.options.wide * segment(bench)
     return collect(bench.robot, _agent(bench, RS), interactions, mesh=bench.mesh, quiet=True)[0]
 
 
 def collecting(bench: Bench, *, method: Method) -> Probe:
-    """What `collect` does: iterations of the agent, its metrics read, its record kept."""
+    """`collect`: iterations of the agent, with its metrics read and its record kept."""
     agent = _agent(bench, method)
     learning, learner = _started(bench, method, agent)
     return _iterating(agent, learning.prepare(learner), learner, lambda part: concatenate([part]))
 
 
 def acting(bench: Bench, *, method: Method) -> Probe:
-    """What `collect` does once the agent has learned: it acts, and all is recorded."""
+    """`collect` with a frozen agent: it acts, and every step is recorded."""
     assert isinstance(method.agent, Frozen)
     agent, _, learner = _programs(bench, dataclasses.replace(method, agent=method.agent.agent))
     frozen = Acting(agent, agent.policy(bench.robot, method.task, learner))
@@ -55,7 +55,7 @@ def acting(bench: Bench, *, method: Method) -> Probe:
 
 
 def unrecorded(bench: Bench) -> Probe:
-    """The same with PPO, of whose record no more is made than PPO learns from."""
+    """`collecting` with PPO, recording only the fields that PPO learns from."""
     agent = _agent(bench, RL)
     learning, learner = _started(bench, RL, agent)
     whole = steps.record
@@ -69,14 +69,14 @@ def unrecorded(bench: Bench) -> Probe:
 
 
 def walking(bench: Bench, *, method: Method) -> Probe:
-    """A learner's stepping alone: the policy is asked, all is recorded, nothing is learned."""
+    """Only the stepping of a learner: its policy acts and every step is recorded; no updates."""
     agent, programs, learner = _programs(bench, method)
     policy = programs.acting(learner.training_state)
     return _steps(agent, lambda lanes: programs.stepping(*policy, lanes)[0], learner.env_state)
 
 
 def updating(bench: Bench, *, method: Method) -> Probe:
-    """An off-policy learner's other half alone: the same steps taken in again and again."""
+    """Only the updates of an off-policy learner: each call adds and learns from the same steps."""
     agent, programs, learner = _programs(bench, method)
     batch = programs.stepping(*programs.acting(learner.training_state), learner.env_state)[2]
     batch = devices.gather(batch, bench.mesh)
@@ -88,7 +88,7 @@ def updating(bench: Bench, *, method: Method) -> Probe:
 
 
 def writing(bench: Bench) -> Probe:
-    """Writing the record to the disk, as `collect` does now and then."""
+    """Writing one chunk of the record to disk, as `collect` does."""
     part = bench.once(record)
     chunk = concatenate([part] * -(-CHUNK // part.interactions))
     call = functools.partial(chunk.save, bench.scratch / "chunk", overwrite=True)
@@ -96,34 +96,34 @@ def writing(bench: Bench) -> Probe:
 
 
 def _agent(bench: Bench, method: Method) -> Any:
-    """The method's agent, which learns from its first iteration on."""
+    """The method's agent with the benchmark's lanes; it learns from the first iteration."""
     agent: Any = method.agent
     agent = dataclasses.replace(agent, num_envs=bench.options.num_envs)
     return dataclasses.replace(agent, min_replay_size=0) if isinstance(agent, OffPolicy) else agent
 
 
 def _programs(bench: Bench, method: Method) -> tuple[Any, RolloutThenLearn, AgentState]:
-    """The method's agent, its two programs, and its learner at the start."""
+    """The method's agent, its two programs, and its initial state."""
     agent = _agent(bench, method)
     programs = agent.programs(bench.robot, method.task, bench.mesh)
     return agent, programs, _placed(programs)
 
 
 def _started(bench: Bench, method: Method, agent: Agent) -> tuple[Learning, Any]:
-    """The agent at work on the method's task, and its learner at the start."""
+    """The agent on the method's task, and its initial state."""
     learning = agent.learning(bench.robot, method.task, bench.mesh)
     return learning, _placed(learning)
 
 
 def _placed(learning: Learning | RolloutThenLearn) -> Any:
-    """A learner at its start, on its devices."""
+    """The initial state of a learner, on its devices."""
     return learning.place(jax.jit(learning.start)(jax.random.key(0)))
 
 
 def _iterating(
     agent: Agent, iterate: Iterate, learner: Any, keep: Callable[[Experience], object]
 ) -> Probe:
-    """Iterations that go on from the learner; `keep` takes what each has recorded."""
+    """Iterations from the state `learner`; `keep` receives the record of each."""
 
     def step(learner: Any) -> Any:
         learner, part, metrics = iterate(learner)
@@ -135,6 +135,6 @@ def _iterating(
 
 
 def _steps(agent: Agent, iteration: Callable[[Any], Any], start: Any) -> Probe:
-    """Steps/s over all lanes of what does an iteration's steps in a call."""
+    """Measures steps/s over all lanes; a call of `iteration` makes one iteration's steps."""
     call = carried(iteration, start)
     return Probe(timed(call, agent.num_envs * agent.unroll_length), counted(agent.num_envs, "lane"))

@@ -1,4 +1,4 @@
-"""Rows: numbers with names, each measured in turns with what it is compared with."""
+"""Rows: named numbers, each measured alternately with the row that it is compared with."""
 
 from __future__ import annotations
 
@@ -26,12 +26,11 @@ class Row:
     """One line of the table.
 
     Attributes:
-      name: what is measured.
-      unit: of its value.
-      build: makes all that is needed to measure it; rows with one `build` share its probe,
-        and so compile once.
+      name: name of the measured part.
+      unit: unit of the value.
+      build: makes the probe; rows with the same `build` share the probe, which compiles once.
       ratio_to: name of the row that it is compared with.
-      rounds: how often it is measured, if the seconds suffice.
+      rounds: number of measurements, if the seconds suffice.
     """
 
     name: str
@@ -42,16 +41,16 @@ class Row:
 
 
 def measure(bench: Bench, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Measures rows, and says on stderr which cannot be measured here.
+    """Measures rows, and prints on stderr the rows that cannot be measured here.
 
     Returns:
-      what stands in the JSON: name, value, unit, ratio_to, ratio, hardware.
+      the rows of the JSON: name, value, unit, ratio_to, ratio, hardware.
     """
     by_row = {row.name: row for row in rows}
     values: dict[str, list[float]] = defaultdict(list)
     ratios: dict[str, float] = {}
     compared = {row.ratio_to for row in rows}
-    # What others are compared with, and itself with nothing, is measured beside them.
+    # A row that only serves for comparison is measured with the rows that need it.
     todo = [row for row in rows if row.ratio_to or row.name not in compared]
     with Progress("benchmark", len(todo), "rows") as bar:
         for row in todo:
@@ -82,7 +81,7 @@ def _result(
     def full(row: Row) -> str:
         return f"{row.name} ({bench.once(row.build).note})"
 
-    # What could not be compared may have been measured all the same, for others' ratios.
+    # A row without a ratio may still have values, from its use as another row's reference.
     base = rows[row.ratio_to] if row.ratio_to and row.name in ratios else None
     return {
         "name": full(row),
@@ -95,16 +94,16 @@ def _result(
 
 
 def _rounded(x: float) -> float | None:
-    """Four digits, as many as timings have; None for what JSON cannot hold."""
+    """Rounds to four digits, the precision of timings; None if not finite (not valid JSON)."""
     return float(f"{x:.4g}") if math.isfinite(x) else None
 
 
 def table(results: Sequence[dict[str, Any]]) -> str:
-    """The rows as text."""
+    """The rows as an aligned text table."""
     head = ("row", "value", "unit", "ratio", "to")
     body = []
     for r in results:
-        base = (r["ratio_to"] or "").partition(" (")[0]  # its note stands in its own line
+        base = (r["ratio_to"] or "").partition(" (")[0]  # the note is in that row's own line
         body.append((r["name"], _number(r["value"]), r["unit"], _number(r["ratio"]), base))
     widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
     align = "<><><"

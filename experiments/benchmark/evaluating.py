@@ -1,4 +1,4 @@
-"""Evaluation: how fast lanes step, and how many of their steps are of use."""
+"""Rows of evaluation: its speed, and the share of useful lane-steps."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from genidm.robots.mujoco import MujocoRobot
 from genidm.rollout import Move, rollout
 from genidm.store import Stage
 
-# Steps before `retracing`'s: by then they walk.
+# Steps before the measured ones, so that the robots walk already.
 WARM_UP = 100
 
 
 def controller(bench: Bench) -> ControllerFn:
-    """That of the run, or an untrained one."""
+    """The controller of `options.run`, or an untrained controller."""
     if bench.options.run:
         return load(bench.options.run, bench.robot)
     turned = rotate_exactly(bench.robot, bench.once(record), jax.random.key(1))
-    # To the next step, as the episodes of a short record may all end before more.
+    # Horizon 1: in a short record, all episodes may end before a longer one.
     samples = pairs(bench.robot, bench.once(record), turned, goal_horizon=1)
     settings = dataclasses.replace(LR.fit, updates=1)
     return fit(bench.robot, samples, jax.random.key(2), settings, quiet=True)
 
 
 def evaluating(bench: Bench) -> Probe:
-    """What `evaluate` does with scenarios; lane-steps without an episode count too."""
+    """`evaluate` with scenarios; lane-steps without an episode count too."""
     settings, test_scenarios = _test(bench)
     evaluator = Evaluator(bench.robot, flatten(test_scenarios), settings, bench.mesh)
     queue = evaluator.start()
@@ -62,7 +62,7 @@ def evaluating(bench: Bench) -> Probe:
 
 
 def _steered(bench: Bench) -> tuple[State, jax.Array]:
-    """Robots `[B]` in the middle of their episodes, and the actions `[STEPS, B, A]` that follow."""
+    """States `[B]` in mid-episode, and the controller's next actions `[STEPS, B, A]`."""
     robot, model = bench.robot, bench.once(controller)
     starts = scenarios(robot, 1, bench.options.wide)
     keys, yaw, target = starts.keys[0], starts.yaw[0], starts.target[0]
@@ -82,10 +82,10 @@ def _steered(bench: Bench) -> tuple[State, jax.Array]:
 
 
 def retracing(bench: Bench) -> Probe:
-    """The limit of `evaluating`: the engine alone makes steps of the test, over and over.
+    """The limit of `evaluating`: the engine alone repeats recorded steps of the test.
 
-    Steered robots are slower to step than robots under random actions: more of their feet are
-    on the ground.
+    Robots with a controller are slower to step than robots with random actions, because more
+    feet are on the ground.
     """
     robot, (state, actions) = bench.robot, bench.once(_steered)
     lanes = actions.shape[1]
@@ -110,7 +110,7 @@ def retracing(bench: Bench) -> Probe:
 
 
 def lane_steps(bench: Bench) -> tuple[float, float]:
-    """Lane-steps of evaluating the scenarios: all of them, and those spent in episodes."""
+    """Lane-steps of evaluating the scenarios: all, and those within episodes."""
     stage = Stage(bench.scratch / "test")
     settings, test_scenarios = _test(bench)
     model = bench.once(controller)
@@ -120,7 +120,7 @@ def lane_steps(bench: Bench) -> tuple[float, float]:
 
 
 def tested(bench: Bench, *, useful: bool) -> Probe:
-    """Lane-steps of evaluating all scenarios: those spent in episodes, or all."""
+    """Lane-steps of evaluating all scenarios: those within episodes if `useful`, else all."""
     seeds, episodes = bench.options.scenarios
     steps = bench.once(lane_steps)
     mean = steps[1] / (seeds * episodes)
@@ -135,5 +135,5 @@ def _test(bench: Bench) -> tuple[EvaluationSettings, Scenarios]:
 
 
 def _steering(bench: Bench) -> str:
-    """Whose controller it is."""
+    """The controller, in words."""
     return Path(bench.options.run).name if bench.options.run else "an untrained controller"

@@ -1,4 +1,4 @@
-"""Fitting: updates of a fit, and the matrix products in them."""
+"""Rows of fitting: updates of a fit, and their matrix products alone."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from genidm.robots import Robot
 
 Shape = tuple[int, int]
 
-# Updates in a call.
+# Updates per call.
 UPDATES = 100
-# Samples to fit to: more than a cache holds, as in a real fit.
+# Number of samples: more than a CPU cache holds, as in a real fit.
 SAMPLES = 200_000
 
 
 def samples(bench: Bench) -> Pairs:
-    """Noise of the shape of e.m.o. pairs, on the fit's device."""
+    """Random noise in the shape of e.m.o. pairs, on the device of the fit."""
     draw, sizes = np.random.default_rng(0), (bench.robot.observation.size, 3)
     s, d = (draw.standard_normal((2, SAMPLES, n), np.float32) for n in sizes)
     a = draw.standard_normal((SAMPLES, bench.robot.action.size), np.float32)
@@ -35,7 +35,7 @@ def samples(bench: Bench) -> Pairs:
 
 
 def fitting(bench: Bench, *, settings: Fit) -> Probe:
-    """Updates of a fit."""
+    """Updates of a fit with these settings."""
     noise = bench.once(samples)
     learner, program = training(bench.robot, noise, jax.random.key(0), settings)
     call = carried(lambda x: program(x, noise, jnp.int32(UPDATES))[0], learner)
@@ -43,10 +43,10 @@ def fitting(bench: Bench, *, settings: Fit) -> Probe:
 
 
 def multiplying(bench: Bench, *, settings: Fit) -> Probe:
-    """The matrix products of an update, forwards and backwards, and nothing else.
+    """Only the matrix products of an update, forward and backward.
 
-    They are those of the gradient of a network of the same shape without biases and
-    nonlinearities; weights move a little, or XLA would take the products out of the loop.
+    These are the products of the gradient of a network of the same shape without biases and
+    nonlinearities. The weights change a little: else XLA would move the products out of the loop.
     """
     psi, phi = _products(bench.robot, settings)
     keys = jax.random.split(jax.random.key(0), 3)
@@ -66,7 +66,7 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
 
 
 def _products(robot: Robot, settings: Fit) -> tuple[list[Shape], list[Shape]]:
-    """Shapes of the matrices in ψ, if there is one, and in φ."""
+    """Shapes of the matrices of ψ (empty if there is none) and of φ."""
     state, latent = robot.observation.size + 3, settings.latent_size
     psi = (state, *settings.lfm, latent) if latent else ()
     phi = (latent or state, *settings.idm, robot.action.size)

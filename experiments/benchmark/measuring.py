@@ -1,4 +1,4 @@
-"""One number, measured again and again, in turns with another."""
+"""Repeated measurements of one number, alternating with other numbers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ T = TypeVar("T")
 
 
 class Skip(Exception):
-    """Why a row cannot be measured here."""
+    """A row cannot be measured here; the message gives the reason."""
 
 
 class Probe(NamedTuple):
-    """A way to measure one number, again and again.
+    """A repeatable measurement of one number.
 
     Attributes:
-      sample: seconds to spend on it → the number, measured once.
-      note: what it was measured on; it stands behind the row's name.
+      sample: measures the number once, in the given seconds.
+      note: sizes and devices, shown after the row's name.
     """
 
     sample: Callable[[float], float]
@@ -29,11 +29,11 @@ class Probe(NamedTuple):
 
 
 def timed(call: Callable[[], object], amount: float) -> Callable[[float], float]:
-    """A sample of how much `call` gets done in a second.
+    """Makes a function that measures the work per second of `call`, in the given seconds.
 
     Args:
       call: does `amount` of work, and returns when it is done.
-      amount: of work in a call.
+      amount: work per call.
     """
     call()  # compiles
 
@@ -48,7 +48,7 @@ def timed(call: Callable[[], object], amount: float) -> Callable[[float], float]
 
 
 def carried(step: Callable[[T], T], carry: T) -> Callable[[], None]:
-    """A call that goes on from where the last one ended."""
+    """Makes a call that applies `step` to the result of the previous call."""
 
     def call() -> None:
         nonlocal carry
@@ -58,10 +58,10 @@ def carried(step: Callable[[T], T], carry: T) -> Callable[[], None]:
 
 
 def interleave(probes: Sequence[Probe], seconds: float, rounds: int) -> np.ndarray:
-    """Samples `[rounds, probes]`: each probe once a round.
+    """Samples `[rounds, probes]`: every probe once per round.
 
-    Every other round goes backwards, so that a steady drift falls on all alike. No round is
-    begun after the seconds are over; one is always made.
+    Every second round has the reverse order, so that a steady drift affects all probes equally.
+    The first round always runs; later rounds start only within the given seconds.
     """
     began, table = time.perf_counter(), list[list[float]]()
     share = seconds / (rounds * len(probes))

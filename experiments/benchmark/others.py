@@ -1,4 +1,4 @@
-"""Others' PPO and others' stepping, to compare ours with."""
+"""Rows of other libraries: Stable-Baselines3's PPO and EnvPool's stepping."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from genidm import devices
 
 
 def baseline(bench: Bench) -> Probe:
-    """Stable-Baselines3's PPO at its defaults on gymnasium's Ant-v5, at its fastest here."""
+    """Stable-Baselines3's PPO with default settings on gymnasium's Ant-v5, at its fastest here."""
     _need(sb3.NEEDED)
     say = functools.partial(tqdm.write, file=sys.stderr)
     setting = sb3.fastest(sb3.candidates(devices.cores()), say)
@@ -29,20 +29,20 @@ def baseline(bench: Bench) -> Probe:
 
 
 def envpool(bench: Bench, *, wide: bool = False) -> Probe:
-    """EnvPool's Ant-v5 under random actions drawn beforehand, one thread a core.
+    """EnvPool's Ant-v5 with random actions drawn in advance; one thread per core.
 
-    It steps gymnasium's model, not ours. A control step is 5 physics steps on both, but its
-    integrator is RK4, which computes the dynamics four times a physics step (our Euler: once),
-    and its solver may make 100 iterations (ours: 4). It also computes rewards, and resets
-    environments whose episode has ended.
+    It steps gymnasium's model, not ours. Both make 5 physics steps per control step, but
+    gymnasium's integrator is RK4, which computes the dynamics four times per physics step (our
+    Euler: once), and its solver may make 100 iterations (ours: 4). EnvPool also computes rewards
+    and resets environments whose episode has ended.
 
     Args:
       bench: sizes.
-      wide: as many environments as 𝒢 and evaluation have lanes.
+      wide: use as many environments as 𝒢 and evaluation have lanes.
     """
     _need(["envpool"])
     lanes, threads = bench.num_envs(wide), devices.cores()
-    # An extra that may be absent: imported by name, so that the types are checked without it.
+    # An optional package: imported by name, so that the type checker does not need it.
     pool = importlib.import_module("envpool").make_gymnasium(
         "Ant-v5", num_envs=lanes, num_threads=threads, seed=0
     )

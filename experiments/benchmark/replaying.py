@@ -1,4 +1,4 @@
-"""𝒢: the record replayed, by itself and with its way to the devices and back."""
+"""Rows of 𝒢: replaying the record, with and without the transfer to the devices and back."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from genidm.progress import Progress
 
 
 def generalizing(bench: Bench, *, program_alone: bool = False) -> Probe:
-    """What `replay` does: blocks sent to the devices, replayed and brought back.
+    """`replay`: sends blocks to the devices, replays them, and brings them back.
 
     Args:
       bench: sizes.
-      program_alone: leave out the sending and bringing back.
+      program_alone: measure without the transfers.
     """
     lanes = bench.robot.max_parallel_envs(bench.options.wide)
     blocks = Blocks(bench.once(record), segment(bench), lanes, bench.mesh.size)

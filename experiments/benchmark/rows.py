@@ -1,4 +1,4 @@
-"""All rows there are, and the choice among them."""
+"""The rows of each robot, and their selection by name."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def _of_humanoid(name: str) -> InverseDynamics:
     return method
 
 
-_P = functools.partial  # one object a build: rows that share it share what it compiles
+_P = functools.partial  # rows with the same partial object share its probe, which compiles once
 _MJX = _P(stepping, engine="mjx")
-# The limit for all that steps the robot: its own engine alone, whichever that is.
+# The limit of every row that steps the robot: its own engine alone.
 _OWN, _OWN_WIDE = "own engine, raw", "own engine, raw, wide"
 _STEERED = "own engine, raw, steered"
 _PPO = _P(collecting, method=RL)
@@ -44,14 +44,14 @@ _SAC: Method = dataclasses.replace(_WALKER, name="SAC", agent=_WALKER.agent.agen
 
 
 def _starts(name: str, what: str, unit: str) -> tuple[Row, Row]:
-    """The rows of one number that `start` prints."""
+    """The rows of one of the numbers that `start` prints."""
     first, second = (_P(starting, second=second, what=what) for second in (False, True))
     base = Row(f"first start, {name}", unit, first, rounds=1)
     return base, Row(f"second start, {name}", unit, second, base.name, 1)
 
 
 def _halves(method: Method) -> tuple[Row, Row, Row]:
-    """The loop of an off-policy learner beside its two halves, each run alone."""
+    """The rows of an off-policy learner: updates alone, stepping alone, and both."""
     learning = Row(f"{method.name}'s learning alone", "steps/s", _P(updating, method=method))
     walk = Row(f"{method.name}'s stepping alone", "steps/s", _P(walking, method=method), _OWN)
     loop = Row(
@@ -61,7 +61,7 @@ def _halves(method: Method) -> tuple[Row, Row, Row]:
 
 
 def _fits(method: InverseDynamics) -> tuple[Row, Row]:
-    """A method's fit beside its matrix products alone."""
+    """The rows of a method's fit: its matrix products alone, and all of it."""
     name, settings = f"fit of {method.name}", method.fit
     products = Row(f"{name}, products alone", "updates/s", _P(multiplying, settings=settings))
     return products, Row(name, "updates/s", _P(fitting, settings=settings), products.name)
@@ -144,18 +144,18 @@ OTHERS: tuple[Row, ...] = (
 )
 """Rows of any other robot with a MuJoCo model."""
 ROWS = {"ant": ANT, "humanoid": HUMANOID}
-"""Robot → its rows: what its agents are, and what there is to compare with."""
+"""Robot → its rows, which depend on its agents and on the libraries to compare with."""
 
 
 def choose(texts: Sequence[str], rows: Sequence[Row]) -> list[Row]:
-    """The rows that are named, and those they are compared with.
+    """Selects rows by name, with the rows that they are compared with.
 
     Args:
-      texts: each is the name of a row, or a part of the names of several; none: all rows.
-      rows: those there are.
+      texts: names of rows, or parts of names; empty: all rows.
+      rows: the rows to select from.
 
     Raises:
-      BadInput: a text is in no name.
+      BadInput: no name contains one of the texts.
     """
     by_row = {row.name: row for row in rows}
     wanted = {name for text in texts for name in _named(text, by_row)} or set(by_row)

@@ -1,9 +1,9 @@
-"""PPO of Stable-Baselines3 on gymnasium's Ant-v5: what `experiments.benchmark` compares with.
+"""PPO of Stable-Baselines3 on gymnasium's Ant-v5, a reference of `experiments.benchmark`.
 
     python -m experiments.benchmark.sb3 --environments 4 --vector DummyVecEnv --threads 1
 
-It runs in a process of its own, as torch and jax would fight for the cores: there `main`
-answers each line on stdin with one iteration, and `Baseline` is the other end of the pipe.
+It runs in a separate process, because torch and jax would compete for the cores. There, `main`
+makes one iteration for each line on stdin; `Baseline` is the other end of the pipe.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import time
 from collections.abc import Callable, Iterable
 
 NEEDED = ("torch", "gymnasium", "stable_baselines3")
-# Environments, how they are stepped, and threads of torch.
+# Number of environments, class that steps them, and threads of torch.
 Setting = tuple[int, str, int]
 
 
 def main() -> None:
-    """Says how many steps an iteration has; makes one for each line of stdin, and says so."""
+    """Prints the steps of an iteration; then makes an iteration for each line on stdin."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--environments", type=int, required=True)
     parser.add_argument("--vector", choices=("DummyVecEnv", "SubprocVecEnv"), required=True)
     parser.add_argument("--threads", type=int, required=True)
     options = parser.parse_args()
-    # An extra that may be absent: imported by name, so that the types are checked without it.
+    # An optional package: imported by name, so that the type checker does not need it.
     sb3 = importlib.import_module("stable_baselines3")
     util = importlib.import_module("stable_baselines3.common.env_util")
     vectors = importlib.import_module("stable_baselines3.common.vec_env")
@@ -47,20 +47,20 @@ def main() -> None:
 
 
 class Ended(RuntimeError):
-    """The process is no more; its last words are on stderr."""
+    """The process has ended; its last output is on stderr."""
 
 
 class Baseline(contextlib.AbstractContextManager):
-    """An agent at its defaults, in a process of its own.
+    """A PPO agent with default settings, in a separate process.
 
     Args:
-      environments: number of them.
-      vector: how they are stepped: "DummyVecEnv" in turn, "SubprocVecEnv" in processes.
-      threads: of torch.
+      environments: number of environments.
+      vector: "DummyVecEnv" steps them one after the other, "SubprocVecEnv" in processes.
+      threads: threads of torch.
 
     Attributes:
-      steps: of an iteration, over all environments.
-      note: its settings, in words.
+      steps: steps per iteration, over all environments.
+      note: the settings, in words.
     """
 
     def __init__(self, environments: int, vector: str, threads: int):
@@ -74,7 +74,7 @@ class Baseline(contextlib.AbstractContextManager):
         self.steps = self._answer()
 
     def iterate(self) -> None:
-        """One iteration: `steps` steps, and learning from them. Raises Ended."""
+        """Makes one iteration: `steps` steps, and learning from them. Raises Ended."""
         assert self._process.stdin
         self._process.stdin.write("\n")
         self._process.stdin.flush()
@@ -96,7 +96,7 @@ class Baseline(contextlib.AbstractContextManager):
         assert self._process.stdout
         line = self._process.stdout.readline()
         if not line:
-            raise Ended("Stable-Baselines3 ended before its time")
+            raise Ended("the process of Stable-Baselines3 has ended early")
         return int(line)
 
     def __exit__(self, *error: object) -> None:
@@ -105,24 +105,24 @@ class Baseline(contextlib.AbstractContextManager):
 
 
 def candidates(cores: int) -> list[Setting]:
-    """What may be fastest: its policy is so small that torch is often best on one core."""
-    ways = [(1, "DummyVecEnv")]
-    ways += [(n, vector) for n in (4, 8) for vector in ("DummyVecEnv", "SubprocVecEnv")]
-    return [(*way, threads) for threads in sorted({1, cores}) for way in ways]
+    """Settings that may be fastest; the policy is so small that one torch thread is often best."""
+    stepping = [(1, "DummyVecEnv")]
+    stepping += [(n, vector) for n in (4, 8) for vector in ("DummyVecEnv", "SubprocVecEnv")]
+    return [(*how, threads) for threads in sorted({1, cores}) for how in stepping]
 
 
 def fastest(settings: Iterable[Setting], say: Callable[[str], object]) -> Setting:
-    """The setting with the most steps/s over one iteration; raises Ended if none made one."""
+    """The setting with the most steps/s in one iteration; raises Ended if all of them failed."""
     rates: dict[Setting, float] = {}
     for setting in settings:
         with Baseline(*setting) as one:
-            # Threads that fight for busy cores can be fifty times slower: not waited for.
+            # On busy cores, many threads can be fifty times slower: hence the time limit.
             best = max(rates.values(), default=0.0)
             rates[setting] = one.rate(max(10.0, 3 * one.steps / best) if best else 600.0)
             say(f"{one.note}: {rates[setting]:.0f} steps/s" if rates[setting] else
                 f"{one.note}: too slow to wait for")  # fmt: skip
     if not any(rates.values()):
-        raise Ended("Stable-Baselines3 made no iteration")
+        raise Ended("no setting of Stable-Baselines3 completed an iteration")
     return max(rates, key=rates.__getitem__)
 
 

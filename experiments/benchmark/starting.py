@@ -1,4 +1,4 @@
-"""Starting: what is compiled until PPO's first iteration is made."""
+"""Rows of starting: compilation up to the end of PPO's first iteration."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from genidm.robots import by_name
 
 
 def starting(bench: Bench, *, second: bool, what: str) -> Probe:
-    """What is compiled until PPO's first iteration is made, in a fresh process.
+    """Compilation up to the end of PPO's first iteration, in a fresh process.
 
     Args:
       bench: the robot.
-      second: with the compilation cache that a first start has left.
-      what: a number that `start` prints.
+      second: use the compilation cache of a first start.
+      what: key of a number that `start` prints.
     """
     number = bench.once(starts)[second][what]
     return Probe(lambda _: number, "PPO's first iteration")
 
 
 def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
-    """What is compiled when a command is started first, and when it is started again."""
+    """The numbers of a first start with an empty cache, and of a second start."""
     environment = os.environ | {"XDG_CACHE_HOME": str(bench.scratch / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     engine = bench.robot.engine_name
@@ -43,14 +43,14 @@ def starts(bench: Bench) -> tuple[dict[str, float], dict[str, float]]:
     def once() -> dict[str, float]:
         out = subprocess.run(command, env=environment, stdout=subprocess.PIPE)
         if out.returncode:
-            raise Skip("a process of its own failed")
+            raise Skip("the separate process failed")
         return json.loads(out.stdout.splitlines()[-1])
 
     return once(), once()
 
 
 def start(robot: str, engine: str | None) -> None:
-    """In a fresh process: makes PPO's first iteration, and prints what was compiled."""
+    """Makes PPO's first iteration, and prints the numbers of `compiling` as JSON."""
     with compiling() as counted:
         agent: Any = RL.agent
         collect(by_name(robot, engine), agent, 1, quiet=True)
@@ -59,11 +59,11 @@ def start(robot: str, engine: str | None) -> None:
 
 @contextlib.contextmanager
 def compiling() -> Iterator[dict[str, float]]:
-    """Counts what jax compiles meanwhile.
+    """Counts what jax compiles within the block.
 
     Yields:
-      "seconds" spent in XLA or in reading its cache, "programs" that were compiled and
-      took long enough to be kept in the cache, "wall" seconds in all.
+      "seconds" in XLA or reading its cache; "programs": number of compiled programs that took
+      long enough to be cached; "wall": seconds in total, set at the end.
     """
     counted = {"seconds": 0.0, "programs": 0.0, "wall": 0.0}
 

@@ -1,4 +1,4 @@
-"""The physics alone: `mujoco.batch`, and the robot stepped by each of its engines."""
+"""Rows of raw stepping: `mujoco.batch`, and `robot.step` on each engine."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from genidm.engines.mujoco import MuJoCo
 from genidm.robots import Robot, State, remade
 from genidm.robots.mujoco import MujocoRobot
 
-# Steps of a lane in a call, as in an iteration of PPO.
+# Steps per lane in a call, as in an iteration of PPO.
 STEPS = 32
 
 
 def batch(bench: Bench, *, wide: bool = False, threads: int | None = None) -> Probe:
-    """`mujoco.batch` under random actions drawn beforehand, and nothing else.
+    """Only `mujoco.batch`, with random actions drawn in advance.
 
     Args:
       bench: sizes.
-      wide: as many lanes as 𝒢 and evaluation have.
-      threads: one for each core, unless given.
+      wide: use the number of lanes of 𝒢 and evaluation.
+      threads: number of threads; default: one per core.
     """
     robot, lanes = on_engine(bench, "mujoco"), bench.num_envs(wide)
     assert isinstance(robot, MujocoRobot)
     threads = threads or devices.cores()
     if threads > devices.cores():
-        raise Skip(f"{threads} threads need as many cores, and there are {devices.cores()}")
+        raise Skip(f"{threads} threads need as many cores, but there are {devices.cores()}")
     simulations = Batch(robot.mj_model, lanes, nthread=threads)
     place(simulations, _standing(robot, lanes).physics)
     actions = np.asarray(_actions(robot, lanes), np.float64)
@@ -50,7 +50,7 @@ def place(simulations: Batch, physics: Physics) -> None:
 
 
 def step_batch(robot: MujocoRobot, simulations: Batch, actions: np.ndarray) -> None:
-    """The control steps of actions `[T, B, A]`, by `mujoco.batch` and nothing else."""
+    """Makes the control steps of actions `[T, B, A]` with `mujoco.batch` alone."""
     for action in actions:
         simulations.ctrl = action
         simulations.step(nstep=robot.frame_skip)
@@ -59,17 +59,17 @@ def step_batch(robot: MujocoRobot, simulations: Batch, actions: np.ndarray) -> N
 def stepping(
     bench: Bench, *, engine: str | None = None, wide: bool = False, count: int | None = None
 ) -> Probe:
-    """`robot.step` under random actions drawn beforehand, and nothing else.
+    """Only `robot.step`, with random actions drawn in advance.
 
     Args:
       bench: sizes.
-      engine: steps the robot; the robot's own, unless given.
-      wide: as many lanes as 𝒢 and evaluation have.
-      count: devices; as many as the engine asks for, unless given.
+      engine: engine that steps the robot; default: the robot's own.
+      wide: use the number of lanes of 𝒢 and evaluation.
+      count: number of devices; default: those that the robot uses.
     """
     robot, lanes = on_engine(bench, engine) if engine else bench.robot, bench.num_envs(wide)
     if (count or 0) > jax.device_count():
-        raise Skip(f"it needs {count} devices, and there are {jax.device_count()}")
+        raise Skip(f"it needs {count} devices, but there are {jax.device_count()}")
     mesh = devices.mesh(jax.devices()[:count]) if count else robot.mesh()
     if lanes % mesh.size:
         raise Skip(f"{lanes} lanes cannot be shared among {mesh.size} devices")
@@ -82,15 +82,15 @@ def stepping(
 
 
 def walk(robot: Robot, state: State, actions: jax.Array) -> State:
-    """The control steps of actions `[T, B, A]`."""
+    """Makes the control steps of actions `[T, B, A]`; returns the last state."""
     return jax.lax.scan(lambda s, a: (robot.step(s, a), None), state, actions)[0]
 
 
 def limit(bench: Bench, *, wide: bool = False) -> Probe:
-    """The robot's own engine alone: the limit for everything that steps the robot.
+    """The robot's own engine alone: the limit of every row that steps the robot.
 
-    For MuJoCo in C it is `mujoco.batch`, without the way from a jitted program to the host and
-    back. For other engines it is `robot.step`.
+    For MuJoCo in C this is `mujoco.batch`, without the calls from a jitted program to the host.
+    For other engines it is `robot.step`.
     """
     if isinstance(bench.robot.engine, MuJoCo):
         probe, what = batch(bench, wide=wide), "mujoco.batch"
@@ -100,10 +100,10 @@ def limit(bench: Bench, *, wide: bool = False) -> Probe:
 
 
 def on_engine(bench: Bench, name: str) -> Robot:
-    """The same robot, stepped by that engine.
+    """The same robot on another engine.
 
     Raises:
-      Skip: it does not step the robot.
+      Skip: the engine cannot step the robot.
     """
     robot = bench.robot
     if name not in robot.engines:
@@ -112,7 +112,7 @@ def on_engine(bench: Bench, name: str) -> Robot:
 
 
 def among(robot: Robot, mesh: Mesh) -> str:
-    """Which threads or devices share the lanes, in words."""
+    """The threads or devices that share the lanes, in words."""
     if isinstance(robot.engine, MuJoCo):
         return counted(robot.engine.threads, "thread")
     return counted(mesh.size, "device")

@@ -24,27 +24,28 @@ from genidm.progress import METRICS, read_metrics
 from genidm.robots import ROBOTS
 from genidm.runs.command import run_cli
 
-# Robot → its cells of the paper's scale, in order. Cells that share a record follow each other.
+# Robot → methods to run at the paper's scale, in order; methods that share a record are adjacent.
 CELLS = {"ant": ("LR", "GE", "RL", "HF")}
-# Shares of the time that is left: the tiny cell's, both engines' speeds', of that MuJoCo's.
+# Fractions of the remaining time: of the trial, of all speeds, and of the speeds on MuJoCo in C.
 TRIAL, SPEEDS, IN_C = 0.35, 0.45, 0.3
-# Seconds that are too few to start a child for.
+# With less than this many seconds left, no child starts.
 LEAST = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is tried, and for how long.
+    """Options of the command.
 
     Attributes:
-      minutes: that all may take. The same command again goes on where it was.
-      results_dir: where gpu.json and gpu.md are written.
-      run_dir: where the cells' runs are kept.
-      engine: of the cells; MJX on an accelerator, unless given. All are measured.
-      robots: one after the other.
-      methods: cells of the paper's scale; LR, and of the Ant GE, RL and HF, unless given.
-      scale: of the cells; "0.01" to try this command.
-      again: measure what was measured before, too.
+      minutes: time limit of the whole call. The same command again resumes.
+      results_dir: directory of gpu.json and gpu.md.
+      run_dir: directory of the runs.
+      engine: engine of the runs; default: MJX on an accelerator. The speeds of all engines are
+        measured in any case.
+      robots: robots, one after the other.
+      methods: methods to run at the given scale; default: LR, and on the Ant also GE, RL and HF.
+      scale: scale of the runs; "0.01" to try this command.
+      again: also repeat measurements that are already there.
     """
 
     minutes: float = 9.0
@@ -69,10 +70,10 @@ class Call:
     """One call of the command.
 
     Args:
-      options: of the command.
+      options: options of the command.
 
     Attributes:
-      failed: parts that did not end well.
+      failed: titles of the parts that failed.
     """
 
     def __init__(self, options: Options):
@@ -80,10 +81,10 @@ class Call:
         self.results, self.failed = Results(options.results_dir), list[str]()
 
     def run(self) -> str:
-        """Everything, as far as the time goes.
+        """Does all parts, until the time is over.
 
         Returns:
-          how far that was.
+          a sentence about what is done.
 
         Raises:
           BadInput: jax does not start here.
@@ -119,7 +120,7 @@ class Call:
         return self.options.methods or CELLS.get(robot, ("LR",))
 
     def _speeds(self, job: Job, seconds: float) -> None:
-        """The engines' speeds; first of those that compile nothing that takes long."""
+        """Measures the speeds of all engines, those with short compilation first."""
         engines = sorted(ROBOTS[job.robot].engines or ("",), key=compiles_long)
         end = self.clock.left - seconds
         for left, engine in zip(range(len(engines), 0, -1), engines, strict=True):
@@ -128,7 +129,7 @@ class Call:
                 self._do(part, share * (self.clock.left - end))
 
     def _cell(self, job: Job) -> bool:
-        """A cell as far as it gets; whether it ended."""
+        """Runs a cell as far as the time allows; returns whether it is finished."""
         began = time.time()
         ended = self._do(job, self.clock.left)
         for row in self.results.rows("stages"):
@@ -137,14 +138,14 @@ class Call:
         return ended
 
     def _pause(self, row: Row, since: float) -> None:
-        """Says of a stage that was under way how far it is."""
+        """Writes seconds and step of an unfinished stage to its row."""
         seconds = round(row["seconds"] + time.time() - row["began"], 1)
         rest = {name: x for name, x in row.items() if name != "began"}
         step = _step(Path(self.options.run_dir) / row["robot"], since)
         self.results.put("stages", rest | {"seconds": seconds, "step": step})
 
     def _do(self, job: Job, seconds: float) -> bool:
-        """Does a part in a child; whether it ended well. What it failed with is written down."""
+        """Does a part in a child; writes its failure, if any, and returns whether it succeeded."""
         title, seconds = _title(job), min(seconds, self.clock.left)
         if seconds < LEAST:
             print(f"{title}: no time is left for it", file=sys.stderr)
@@ -163,7 +164,7 @@ class Call:
         return ended.status == 0
 
     def _got(self) -> str:
-        """How far the cells are, in a sentence."""
+        """A sentence about finished cells and unfinished stages."""
         done = [f"{x['robot']} {x['method']}" for x in self.results.rows("cells")]
         parts = [f"done: {', '.join(done) or 'no cell'}"]
         for row in self.results.rows("stages"):
@@ -174,7 +175,7 @@ class Call:
 
 
 def compiles_long(engine: str) -> bool:
-    """Whether an engine, by its name, is made of jax operations."""
+    """Whether the engine of this name consists of jax operations, which compile slowly."""
     return engine in ENGINES and ENGINES[engine].on_accelerator
 
 
@@ -185,7 +186,7 @@ def _title(job: Job) -> str:
 
 
 def _failure(job: Job, ended: Ended, seconds: float) -> str | None:
-    """What a part failed with; None if it did not, or was only stopped on its way."""
+    """Why a part failed; None if it succeeded, or was stopped and can resume."""
     if ended.status is None:
         late = f"did not end within {seconds:.0f} s\n{ended.said}"
         return late if job.part in ("trial", "report") else None
@@ -195,7 +196,7 @@ def _failure(job: Job, ended: Ended, seconds: float) -> str | None:
 
 
 def _step(root: Path, since: float) -> int | None:
-    """The last step in the newest metrics, under `root`, of a stage that is not done."""
+    """The last step in the newest metrics of an unfinished stage under `root`; None if unknown."""
     undone = [x for x in root.glob(f"*/{METRICS}") if not x.with_name("done.json").exists()]
     newest = max(undone, key=lambda path: path.stat().st_mtime, default=None)
     if newest is None or newest.stat().st_mtime < since:
@@ -205,16 +206,16 @@ def _step(root: Path, since: float) -> int | None:
 
 
 def gpu(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> None:
-    """Runs everything; a part that failed shows in the exit status."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the child is stopped, too
+    """Runs all parts; the exit status is 1 if a part failed."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # exit handlers also stop the child
     call = Call(options)
     got = call.run()
     print(call.results.path.with_suffix(".md").read_text(encoding="utf-8"))
-    print(f"{got}. The same command goes on from here.")
+    print(f"{got}. Run the same command again to resume.")
     if call.failed:
         print(f"error: failed: {'; '.join(call.failed)}", file=sys.stderr)
         sys.exit(1)
 
 
 if __name__ == "__main__":
-    run_cli(gpu, "Tries, measures and uses a GPU, within a time limit.")
+    run_cli(gpu, "Tests, measures and uses a GPU within a time limit.")

@@ -1,4 +1,4 @@
-"""Cells of Table 1: a tiny one that shows that all of it runs, and those of the paper's scale."""
+"""Cells of Table 1 (a method on a robot): a tiny one as a test, and those of the paper's scale."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from genidm.runs.resolve import Options
 from genidm.runs.run import InverseDynamicsRun, Run
 from genidm.store import Stage
 
-# Interactions of the tiny cell: an off-policy learner makes its first updates before they end.
-# The programs that collect are those of the paper's scale, and lie in the cache afterwards.
+# Interactions of the tiny cell: enough for the first updates of an off-policy learner. It compiles
+# the same collecting programs as the paper's scale, and so fills the cache.
 INTERACTIONS = 20_000
 EPISODES = 2
 TEST = EvaluationSettings(max_steps=40, chunk=10)
-# An agent that has just begun falls before it has come farther.
+# Steps; an agent that has learned so little falls early.
 GOAL_HORIZON = 5
 
 
 def trial(robot: Robot) -> dict[str, Any]:
-    """LR, end to end, at a tiny scale; seconds in all, and in XLA's compiler."""
+    """Runs LR end to end at a tiny scale; returns the seconds in total and of compilation."""
     method = by_name("LR", robot.name)
     assert isinstance(method, InverseDynamics)
     method = dataclasses.replace(method, goal_horizon=GOAL_HORIZON)
@@ -48,10 +48,10 @@ class Part(NamedTuple):
     """A part of a cell.
 
     Attributes:
-      name: what is done in it.
-      stage: name of its directory, or what stands for it in results.
-      done: whether there is nothing to do.
-      work: does it.
+      name: name of the work.
+      stage: name of its directory, or a substitute for it in the results.
+      done: whether the part is finished.
+      work: does the part.
     """
 
     name: str
@@ -61,16 +61,16 @@ class Part(NamedTuple):
 
 
 def run(robot: Robot, method: str, options: Options, results: Results) -> dict[str, Any]:
-    """A cell, part by part; each has a row while it is under way and when it is done.
+    """Runs a cell part by part; each part has a row while it runs and when it is done.
 
     Args:
-      robot: what is steered.
-      method: by its name.
-      options: scale and place.
-      results: where the parts' rows go.
+      robot: the robot.
+      method: name of the method.
+      options: scale and directory of the run.
+      results: where the rows of the parts are written.
 
     Returns:
-      what its test came to, and the seconds that its parts took, over all calls.
+      the results of the test, and the seconds of all parts over all calls.
     """
     this = make_run(robot, by_name(method, robot.name), options)
     scenarios = scenarios_of(this, options)
@@ -83,7 +83,7 @@ def run(robot: Robot, method: str, options: Options, results: Results) -> dict[s
 
 
 def _parts(this: Run[Any], scenarios: Scenarios) -> Iterator[Part]:
-    """The parts of a cell, in the order that they need each other."""
+    """Yields the parts of a cell; each depends on those before it."""
 
     def part(name: str, stage: Stage, work: Callable[[], Any]) -> Part:
         return Part(name, stage.directory.name, stage.done, work)
@@ -99,12 +99,12 @@ def _parts(this: Run[Any], scenarios: Scenarios) -> Iterator[Part]:
             yield part("𝒢", this.replay_stage, again)
     learning = part("learning", this.controller_stage, this.controller)
     yield learning
-    # Its stage is known once it is done; to ask for it again costs nothing.
+    # The test's stage skips its work if it is done, so `done` may always be False here.
     yield Part("testing", f"test of {learning.stage}", False, lambda: this.run_test(scenarios))
 
 
 def _do(results: Results, names: dict[str, Any], part: Part) -> None:
-    """Does a part, unless it is done, and adds the seconds that it took to those before."""
+    """Does a part, unless it is done, and adds its seconds to those of earlier calls."""
     if part.done:
         return
     row = names | {"stage": part.stage, "part": part.name}
@@ -117,7 +117,7 @@ def _do(results: Results, names: dict[str, Any], part: Part) -> None:
 
 
 def _outcome(stage: Stage) -> dict[str, Any]:
-    """What a test came to."""
+    """The results of a test: distances in metres, fractions of episodes."""
     tree, _ = files.load_arrays(stage.path("episodes"))
     closest, fell = (np.asarray(tree["episodes"][name]) for name in ("closest", "fell"))
     return {

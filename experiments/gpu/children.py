@@ -1,4 +1,4 @@
-"""Child processes that are stopped when their time is over."""
+"""Child processes with a time limit."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import time
 from collections.abc import Sequence
 from typing import IO, NamedTuple
 
-# Seconds that a process has to end after it is asked to.
+# Seconds between the request to end and the kill.
 GRACE = 3.0
-# Characters of a child's output that are kept, and lines of them that are shown.
+# Characters of a child's output that are kept, and lines that a failure shows.
 KEPT, SHOWN = 20_000, 25
-# Exit status of a child that ended itself because its time was over, as `timeout` has it.
+# Exit status of a child that ended itself at its time limit, as in `timeout`.
 TIME_IS_OVER = 124
 
 
@@ -25,8 +25,8 @@ class Ended(NamedTuple):
     """How a child ended.
 
     Attributes:
-      status: its exit status; None if it was stopped because its time was over.
-      said: the end of its output.
+      status: exit status; None if the child was stopped at its time limit.
+      said: the last lines of its output.
     """
 
     status: int | None
@@ -34,11 +34,11 @@ class Ended(NamedTuple):
 
 
 def run(command: Sequence[str], seconds: float) -> Ended:
-    """Runs a command, shows its output on stderr, and stops it after so many seconds.
+    """Runs a command, shows its output on stderr, and stops it after `seconds`.
 
     Args:
       command: program and arguments.
-      seconds: how long it may run. The processes that it has started end with it.
+      seconds: time limit. The processes that the command has started are stopped too.
     """
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
@@ -56,20 +56,20 @@ def run(command: Sequence[str], seconds: float) -> Ended:
 
 
 def end_after(seconds: float) -> None:
-    """Ends this process after so many seconds, also if its parent is no more."""
+    """Ends this process after `seconds`, also if its parent has ended."""
     timer = threading.Timer(seconds, os._exit, (TIME_IS_OVER,))
     timer.daemon = True
     timer.start()
 
 
 def _environment() -> dict[str, str]:
-    """A child's environment: checkpoints are frequent, output is not held back."""
+    """Environment of a child: frequent checkpoints, unbuffered output."""
     usual = {"GENIDM_CHECKPOINT_SECONDS": "20", "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     return usual | os.environ
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    """Ends what is left of a child's process group, in a hurry if it does not do so itself."""
+    """Ends a child's process group: asks with SIGTERM, then kills."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, number)
@@ -81,14 +81,14 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 def _group_lives(group: int) -> bool:
     try:
-        os.killpg(group, 0)  # signal 0 only asks
+        os.killpg(group, 0)  # signal 0 only tests whether the group exists
     except (ProcessLookupError, PermissionError):
         return False
     return True
 
 
 class _Said:
-    """The output of a process: shown as it comes, its end kept."""
+    """The output of a process: copied to stderr at once, its last part kept."""
 
     def __init__(self, pipe: IO[bytes] | None):
         assert pipe
@@ -104,7 +104,7 @@ class _Said:
             sys.stderr.flush()
 
     def end(self) -> str:
-        """The last lines, without the progress bars among them."""
+        """The last lines, without progress bars."""
         self._thread.join(GRACE)
         lines = [line.rstrip() for line in re.split(r"[\r\n]+", self._text)]
         return "\n".join([x for x in lines if x and not re.search(r"\d%\|", x)][-SHOWN:])
@@ -119,12 +119,12 @@ class Clock:
 
     def __init__(self, minutes: float):
         self._began = time.monotonic()
-        # What is left of it when the last child has to be stopped.
+        # The last child must be stopped `GRACE` before the limit.
         self._end = self._began + max(60 * minutes - GRACE, 0.0)
 
     @property
     def left(self) -> float:
-        """Seconds that children may still take."""
+        """Seconds left for children."""
         return max(self._end - time.monotonic(), 0.0)
 
     @property

@@ -1,4 +1,4 @@
-"""What child processes do: `python -m experiments.gpu.jobs JSON`, a `Job` in JSON."""
+"""The work of a child process: `python -m experiments.gpu.jobs JSON`, where JSON is a `Job`."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from genidm.runs.resolve import Options
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A part of a call that a child does.
+    """A part of a call, which one child does.
 
     Attributes:
-      part: its name in `PARTS`.
-      results_dir: where the results lie.
-      run_dir: where the stages of the cells lie.
-      robot: by its name.
-      engine: by its name; in `look` the one that is chosen where jax runs, unless given.
-      method: of a cell, by its name.
-      scale: of a cell.
-      minutes: that the whole call was given.
-      seconds: that this part is given.
-      again: measure what was measured before, too.
+      part: name of the part in `PARTS`.
+      results_dir: directory of the results.
+      run_dir: directory of the runs.
+      robot: name of the robot.
+      engine: name of the engine; if None, `look` chooses it from jax's device.
+      method: name of the method of a cell.
+      scale: scale of a cell.
+      minutes: time limit of the whole call.
+      seconds: time limit of this part.
+      again: also repeat measurements that are already there.
     """
 
     part: str
@@ -54,36 +54,36 @@ class Job:
 
     @property
     def stepper(self) -> str:
-        """Name of the engine that steps the robot: the one asked for, if it can."""
+        """Name of the engine that steps the robot: `engine` if the robot has it, else its first."""
         offered = ROBOTS[self.robot].engines
         asked = self.engine
         return asked if asked is not None and asked in offered else next(iter(offered), "its own")
 
     def made(self) -> Robot:
-        """The robot, on its engine."""
+        """The robot on its engine."""
         offered = ROBOTS[self.robot].engines
         return robot_by_name(self.robot, self.stepper if offered else None)
 
     @property
     def results(self) -> Results:
-        """Where the results lie."""
+        """The results of all calls."""
         return Results(Path(self.results_dir))
 
     @property
     def options(self) -> Options:
-        """Of a cell."""
+        """Options of a cell's run."""
         return Options(scale=self.scale, run_dir=Path(self.run_dir))
 
     @property
     def names(self) -> dict[str, Any]:
-        """What names the rows of its robot, engine and cell."""
+        """The fields that identify result rows of this job."""
         return dict(robot=self.robot, engine=self.stepper, method=self.method, scale=self.scale)
 
 
 def look(job: Job) -> None:
-    """Writes down where this runs."""
+    """Writes down machine, versions and engine; begins the call in the results."""
     here, first = environment(), jax.devices()[0]
-    # Where only the files were brought, and no repository.
+    # On a machine that has the files but no git repository.
     here["commit"] = here["commit"] or os.environ.get("GENIDM_COMMIT")
     kind = f"{jax.device_count()} × {first.device_kind}"
     machine = here["hardware"] if first.platform == "cpu" else kind
@@ -96,12 +96,12 @@ def look(job: Job) -> None:
 
 
 def trial(job: Job) -> None:
-    """LR at a tiny scale."""
+    """Runs LR at a tiny scale."""
     job.results.put("trials", {"robot": job.robot, "engine": job.stepper} | cells.trial(job.made()))
 
 
 def measure(job: Job) -> None:
-    """Steps a second, by number of lanes."""
+    """Measures steps per second by number of lanes."""
     results = job.results
 
     def known(names: Row) -> Row | None:
@@ -116,14 +116,14 @@ def measure(job: Job) -> None:
 
 
 def run_cell(job: Job) -> None:
-    """A cell of Table 1, as far as it gets."""
+    """Runs a cell of Table 1."""
     assert job.method
     outcome = cells.run(job.made(), job.method, job.options, job.results)
     job.results.put("cells", job.names | outcome)
 
 
 def report(job: Job) -> None:
-    """The table of all cells that have ended."""
+    """Writes and prints the table of all finished cells."""
     robot = job.made()
     assert job.method
     this = make_run(robot, by_name(job.method, robot.name), job.options)
@@ -140,11 +140,11 @@ PARTS: dict[str, Callable[[Job], None]] = {
     "cell": run_cell,
     "report": report,
 }
-"""Name of a part → what does it."""
+"""Name of a part → the function that does it."""
 
 
 def start(job: Job, seconds: float) -> children.Ended:
-    """Does a job in a child, for at most so many seconds."""
+    """Does a job in a child, with a time limit in seconds."""
     text = json.dumps(dataclasses.asdict(dataclasses.replace(job, seconds=seconds)))
     return children.run([sys.executable, "-m", __spec__.name, text], seconds)
 
@@ -152,7 +152,7 @@ def start(job: Job, seconds: float) -> children.Ended:
 def main() -> None:
     """Does the job that the command line names."""
     job = Job(**json.loads(sys.argv[1]))
-    # If it is not stopped from outside, because nobody is there any more.
+    # In case the parent has ended and cannot stop this process.
     children.end_after(job.seconds + 2 * children.GRACE)
     PARTS[job.part](job)
 

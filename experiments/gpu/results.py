@@ -1,4 +1,4 @@
-"""What is written: one JSON file, and a table made from it, at every new number."""
+"""The results: a JSON file and tables made from it, rewritten for every new number."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from genidm import files
 
-# Kind of a row → the fields that name it: a new row takes the place of the one so named.
+# Kind of a row → the fields that identify it: a new row replaces the row with equal fields.
 KEYS = {
     "trials": ("robot", "engine"),
     "speeds": ("robot", "what", "engine", "lanes"),
@@ -24,19 +24,19 @@ Row = dict[str, Any]
 
 
 class Results:
-    """`gpu.json`: rows of numbers by machine; and `gpu.md`, the same for people.
+    """`gpu.json`, rows of numbers by machine, and `gpu.md`, the same as tables.
 
-    One process at a time writes: the command, or the child that it waits for.
+    Only one process writes at a time: the command, or the child that it waits for.
 
     Args:
-      directory: where both files lie.
+      directory: directory of both files.
     """
 
     def __init__(self, directory: Path | str):
         self.path = Path(directory) / "gpu.json"
 
     def begin(self, machine: str, call: Row) -> None:
-        """Says on which machine the rows to come are measured, and how."""
+        """Begins a call: later rows belong to this machine and call."""
 
         def edit(data: dict[str, Any]) -> None:
             data["now"] = machine
@@ -47,15 +47,15 @@ class Results:
 
     @property
     def call(self) -> Row:
-        """What is known of the call that was begun last."""
+        """The data of the latest call."""
         return _section(self._read())["calls"][-1]
 
     def end(self, **facts: Any) -> None:
-        """Adds to what is known of the call that was begun last."""
+        """Adds data to the latest call."""
         self._change(lambda data: _section(data)["calls"][-1].update(facts))
 
     def put(self, kind: str, row: Row) -> None:
-        """Writes a row, in place of the one that has its names."""
+        """Writes a row; replaces the row with the same identifying fields (`KEYS`)."""
 
         def edit(data: dict[str, Any]) -> None:
             section = _section(data)
@@ -65,7 +65,7 @@ class Results:
         self._change(edit)
 
     def drop(self, kind: str, row: Row) -> None:
-        """Removes the row that has these names, if there is one."""
+        """Removes the row with the same identifying fields, if it exists."""
 
         def edit(data: dict[str, Any]) -> None:
             section = _section(data)
@@ -75,15 +75,15 @@ class Results:
             self._change(edit)
 
     def rows(self, kind: str) -> list[Row]:
-        """All rows of a kind from this machine."""
+        """All rows of a kind on this machine."""
         return _section(self._read()).get(kind, [])
 
     def find(self, kind: str, row: Row) -> Row | None:
-        """The row that has these names, from whichever call on this machine."""
+        """The row with the same identifying fields, of any call on this machine, or None."""
         return next((x for x in self.rows(kind) if _alike(kind, x, row)), None)
 
     def current(self, kind: str, row: Row) -> bool:
-        """Whether the row is there, and was measured with the versions of this call."""
+        """Whether the row exists and was measured with the same versions as this call."""
         found, calls = self.find(kind, row), _section(self._read())["calls"]
         return found is not None and _versions(calls[found["call"]]) == _versions(calls[-1])
 
@@ -113,7 +113,7 @@ def _versions(call: Row) -> Any:
 
 
 def markdown(data: dict[str, Any]) -> str:
-    """All machines' rows as tables."""
+    """The rows of all machines as Markdown tables."""
     parts = ["# What ran on which machine", "Written by `python -m experiments.gpu`."]
     for name, section in data["machines"].items():
         parts += [f"## {name}", *_calls(section), *_tables(section), *_failures(section)]
@@ -135,7 +135,7 @@ def _call(call: Row) -> str:
 
 
 def _tables(section: dict[str, Any]) -> Iterator[str]:
-    """The kinds of rows that there are, a table each."""
+    """Yields one table per kind of rows."""
     heads: dict[str, tuple[str, Callable[[Row], tuple[Any, ...]]]] = {
         "trials": ("trial | engine | s | of them compiling", _trial),
         "speeds": (

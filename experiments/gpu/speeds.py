@@ -1,4 +1,4 @@
-"""Steps a second by number of lanes: the robot's step alone, 𝒢, and the test."""
+"""Steps per second by number of lanes: of `robot.step` alone, of 𝒢, and of the test."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from genidm.paper.methods import LR
 from genidm.paper.replaying import Runner
 from genidm.robots import Robot, State
 
-# Numbers of lanes, for engines of an accelerator and for others.
+# Numbers of lanes on engines that run on an accelerator, and on others.
 LANES, FEW_LANES = (128, 512, 2048, 8192), (128, 512)
-# Steps of a lane in a call.
+# Steps per lane in a call.
 STEPS = 32
-# Calls of which the median is taken: at least three, and more for so many seconds.
+# The rate is a median over calls: at least `CALLS`, and more until `SECONDS` are over.
 CALLS, SECONDS = 3, 2.0
-# Programs that are compiled side by side for an accelerator; its host has cores for that.
+# Programs compiled in parallel for an accelerator; its host has idle cores.
 WORKERS = 3
 
 
 class Probe(NamedTuple):
-    """Something to be timed.
+    """A call to be timed.
 
     Attributes:
       call: does `steps` steps, and returns when they are done.
-      steps: over all lanes.
+      steps: steps per call, over all lanes.
     """
 
     call: Callable[[], object]
@@ -48,7 +48,7 @@ class Probe(NamedTuple):
 
 
 def stepping(robot: Robot, lanes: int) -> Probe:
-    """`robot.step` under random actions drawn beforehand, and nothing else."""
+    """Only `robot.step`, with random actions drawn in advance."""
     mesh = robot.mesh()
     state = devices.put(_standing(robot, lanes), mesh)
     actions = devices.put(_actions(robot, lanes), mesh, 1)
@@ -62,9 +62,9 @@ def stepping(robot: Robot, lanes: int) -> Probe:
 
 
 def generalizing(robot: Robot, lanes: int) -> Probe:
-    """𝒢 of one block, sent to the devices and brought back as `replay` does."""
+    """𝒢 of one block, with its transfer to the devices and back, as in `replay`."""
     state, actions = _standing(robot, lanes), _actions(robot, lanes)
-    # Robots are placed at the first step alone, so that one physics serves all others.
+    # Robots are set only at the first step, so the physics of other steps does not matter.
     physics, s = jax.tree.map(
         lambda x: np.broadcast_to(np.asarray(x), (STEPS, *x.shape)),
         (state.physics, state.observation),
@@ -83,7 +83,7 @@ def generalizing(robot: Robot, lanes: int) -> Probe:
 
 
 def testing(robot: Robot, lanes: int) -> Probe:
-    """The test with an untrained LR; a scenario for each lane, so that all have one."""
+    """The test with an untrained LR controller, with as many scenarios as lanes."""
     test_scenarios = flatten(scenarios(robot, 1, lanes))
     test = Evaluator(
         robot, test_scenarios, EvaluationSettings(num_envs=lanes, chunk=STEPS), robot.mesh()
@@ -103,7 +103,7 @@ PROBES: dict[str, Callable[[Robot, int], Probe]] = {
     "𝒢": generalizing,
     "test": testing,
 }
-"""What is measured → how it is built."""
+"""Name of a measurement → the function that builds its probe."""
 
 
 def _standing(robot: Robot, lanes: int) -> State:
@@ -126,24 +126,24 @@ def _untrained(robot: Robot) -> Controller:
 
 
 class Built(NamedTuple):
-    """A probe that is ready, or what kept it from being so, and the seconds until then."""
+    """A probe, or the error that building it raised; and the seconds of building."""
 
     probe: Probe | Exception
     seconds: float
 
 
 class Measuring:
-    """Measures from few lanes to many, as long as there is time.
+    """Measures from few lanes to many, within a time limit.
 
-    Where a number of lanes fails (for want of memory, say) its row says so, and more lanes are
-    not tried.
+    If a number of lanes fails (for example for lack of memory), its row has the error, and more
+    lanes are not tried.
 
     Args:
-      robot: whose steps are counted.
-      engine: its engine's name.
-      seconds: that it may take; numbers of lanes that would take longer are left out.
-      known: a row with these names that need not be measured again, if there is one.
-      save: takes a row as soon as it is measured.
+      robot: the robot to step.
+      engine: name of its engine.
+      seconds: time limit; numbers of lanes that would exceed it are left out.
+      known: returns the row with these identifying fields, if it need not be measured again.
+      save: receives each row as soon as it is measured.
     """
 
     def __init__(
@@ -159,18 +159,18 @@ class Measuring:
         self._failed: set[str] = set()
 
     def run(self) -> bool:
-        """Measures what is not known; whether nothing is left out for want of time."""
+        """Measures the missing rows; returns False if some are left out for lack of time."""
         devices, took = self._robot.mesh().size, 0.0
         engine = self._robot.engine
         for asked in LANES if engine and engine.on_accelerator else FEW_LANES:
-            lanes = -(-asked // devices) * devices  # as many as they can share evenly
+            lanes = -(-asked // devices) * devices  # devices need equal numbers of lanes
             todo = [what for what in PROBES if self._wanted(self._names(what, lanes))]
             if todo and self._end - time.monotonic() < took:
                 print(f"{lanes} lanes: not enough time is left", file=sys.stderr)
                 return False
             began = time.monotonic()
             self._measure(todo, lanes)
-            # With more lanes it takes longer, but not in proportion: most of it is compiling.
+            # Most of the time is compilation, so it grows more slowly than the number of lanes.
             took = max(took, time.monotonic() - began)
         return True
 
@@ -184,7 +184,7 @@ class Measuring:
         return row is None and names["what"] not in self._failed
 
     def _measure(self, todo: list[str], lanes: int) -> None:
-        """Compiles all, side by side where there are cores for that, and then times each."""
+        """Compiles all probes, in parallel for an accelerator, then times each."""
         workers = WORKERS if devices.accelerated() else 1
         with ThreadPoolExecutor(workers) as pool:
             ready = list(pool.map(lambda what: _build(what, self._robot, lanes), todo))
@@ -200,13 +200,13 @@ def _build(what: str, robot: Robot, lanes: int) -> Built:
     began = time.perf_counter()
     try:
         probe: Probe | Exception = PROBES[what](robot, lanes)
-    except Exception as error:  # of whatever kind: the other rows do not depend on it
+    except Exception as error:  # any error: the other rows do not depend on it
         probe = error
     return Built(probe, time.perf_counter() - began)
 
 
 def _row(built: Built, end: float) -> Row:
-    """A row: the median rate of several calls, or what kept it from being measured."""
+    """The row of a probe: the median rate of several calls, or the error."""
     try:
         if isinstance(built.probe, Exception):
             raise built.probe
@@ -217,7 +217,7 @@ def _row(built: Built, end: float) -> Row:
 
 
 def _timed(probe: Probe, end: float) -> Row:
-    """The median rate of several calls, after one that warms up."""
+    """The median rate of several calls, after a warm-up call."""
     probe.call()
     began, taken = time.perf_counter(), list[float]()
     while len(taken) < CALLS or (time.perf_counter() - began < SECONDS and time.monotonic() < end):
@@ -235,7 +235,7 @@ def _timed(probe: Probe, end: float) -> Row:
 
 
 def _digits(x: float) -> float:
-    """Four digits, as many as timings have."""
+    """Rounds to four digits, the precision of timings."""
     return float(f"{x:.4g}")
 
 

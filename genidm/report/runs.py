@@ -105,7 +105,7 @@ class Runs:
         return [self.root / name for name in sorted(names) if Stage(self.root / name).done]
 
     def last_chunk(self) -> Path | None:
-        """The last chunk of the record of the lowest row that has one on disk; None if no row has."""
+        """The last chunk of the record of the lowest row that has one on disk, or None."""
         for tests in reversed(self.found.values()):
             stage = tests[0].summary.get("experience")
             chunks = sorted(self.root.glob(f"{stage}/experience/chunk_*")) if stage else []
@@ -146,7 +146,7 @@ def _finished(
     done = sorted(
         root.glob(f"test-*/{DONE}"), key=lambda path: (path.parent in own, path.stat().st_mtime)
     )
-    asked = (scale, to_json(settings), robot.engine_name)
+    wanted = (scale, to_json(settings), robot.engine_name)
     for path in done:
         try:
             summary = files.load_json(path)
@@ -155,7 +155,7 @@ def _finished(
             # One file of an older version, or of another program, must not prevent the report.
             print(f"warning: {path} is not the summary of a test; left out", file=sys.stderr)
             continue
-        if found == asked:
+        if found == wanted:
             yield Tested(path.parent, summary)
 
 

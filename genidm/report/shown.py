@@ -134,10 +134,10 @@ def _changes(runs: Runs) -> dict[str, np.ndarray]:
     chunk = runs.last_chunk()
     if chunk is None:
         return {}
-    asked = probes(runs.robot, experience.load(chunk, runs.robot))
+    states = probes(runs.robot, experience.load(chunk, runs.robot))
     paths = {name: tests[0].controller for name, tests in runs.found.items()}
     return {
-        name: invariance(runs.robot, controller.load(path, runs.robot), *asked, ANGLES)
+        name: invariance(runs.robot, controller.load(path, runs.robot), *states, ANGLES)
         for name, path in paths.items()
         if path.exists()
     }

@@ -99,11 +99,13 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
     several = {name: m["collecting_seeds"] for name, m in methods.items() if _several(m)}
     if several:
         notes.append(_over_seeds(several))
-    turned = [f"{name} {m['invariance']:.2g}" for name, m in methods.items() if "invariance" in m]
-    if turned:
+    invariance = [
+        f"{name} {m['invariance']:.2g}" for name, m in methods.items() if "invariance" in m
+    ]
+    if invariance:
         notes.append(
             "Mean change of the action when robot and goal are rotated together by up to 180° "
-            f"(Def. 3): {', '.join(turned)}."
+            f"(Def. 3): {', '.join(invariance)}."
         )
     notes += _origins(methods)
     for module, digests in results.get("other_code", {}).items():

@@ -126,14 +126,14 @@ def who_set_what(
         else given
     )
     lines = []
-    for who, before, after in (
+    for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),
         ("set by you", chosen, given),
         ("unlike the paper (see --paper-settings)", papers, given),
     ):
         changes = [c for c in differences(before, after) if not c.startswith("name ")]
         if changes:
-            lines.append(f"{given.name}, {who}: {', '.join(changes)}")
+            lines.append(f"{given.name}, {origin}: {', '.join(changes)}")
     return tuple(lines)
 
 

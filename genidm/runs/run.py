@@ -156,26 +156,26 @@ class Run(abc.ABC, Generic[M]):
         return stage
 
     def _tested(self, stage: Stage, scenarios: Scenarios) -> dict[str, Any]:
-        model, walks = self.controller(), fig8_scenarios(self.robot)
-        shown = walks.yaw.size
+        model, fig8 = self.controller(), fig8_scenarios(self.robot)
+        first = fig8.yaw.size
         outcome, traces = run(
             self.robot,
             model,
-            flatten(walks, scenarios),
+            flatten(fig8, scenarios),
             self.test,
-            traced=shown + min(RECORDED_EPISODES, scenarios.shape[1]),
+            traced=first + min(RECORDED_EPISODES, scenarios.shape[1]),
             record=position_and_physics,
             stage=stage,
         )
-        rest = jax.tree.map(lambda x: np.asarray(x)[shown:], outcome)
-        trajectories = [trace.position for trace in traces[:shown]]
-        recordings = self._recordings(traces[shown:], scenarios.target[0])
-        outcomes = episodes(rest, scenarios.shape)
+        tested = jax.tree.map(lambda x: np.asarray(x)[first:], outcome)
+        trajectories = [trace.position for trace in traces[:first]]
+        recordings = self._recordings(traces[first:], scenarios.target[0])
+        outcomes = episodes(tested, scenarios.shape)
         save_test(stage, outcomes, trajectories, recordings)
         return (
             self.controller_stage.summary()
             | sanity.walked(self.method.name, outcomes)
-            | sanity.heeds(self.method.name, trajectories, np.asarray(walks.target))
+            | sanity.heeds(self.method.name, trajectories, np.asarray(fig8.target))
             | {"seed": self.seed, "scale": self.scale.name, "scenarios": scenarios.digest()}
             | {"engine": self.robot.engine_name}
             | {"test": to_json(self.test), "fit": self.controller_stage.directory.name}
@@ -280,10 +280,11 @@ class InverseDynamicsRun(Run[InverseDynamics]):
             return None
 
         def work() -> dict[str, Any]:
-            turned = replay(self.robot, record, self._key(1), self.method.generalize)
-            turned.save(stage.path("replay"))
-            files.save_arrays(stage.path("residual"), residual(record, turned), {}, overwrite=True)
-            return {"replayed": turned.yaw.size}
+            replayed = replay(self.robot, record, self._key(1), self.method.generalize)
+            replayed.save(stage.path("replay"))
+            errors = residual(record, replayed)
+            files.save_arrays(stage.path("residual"), errors, {}, overwrite=True)
+            return {"replayed": replayed.yaw.size}
 
         stage.run_once(work)
         return stage.read(RotatedReplay.load, "replay")
