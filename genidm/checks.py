@@ -1,4 +1,4 @@
-"""Ranges of settings, checked where the settings are declared."""
+"""Checks of settings: each class declares the ranges of its own settings."""
 
 from __future__ import annotations
 
@@ -8,39 +8,39 @@ from typing import Any
 
 from genidm.errors import BadInput
 
-# (value) → why it cannot be, as the end of "NAME …"; None if it can.
+# (value) → why the value is not allowed, to follow "NAME …"; None if it is allowed.
 Allowed = Callable[[Any], str | None]
 
-# Far beyond what any machine does, and far below what numbers of 32 bits hold.
+# Default maximum of a count: more than any run needs, and far from an overflow of int32.
 MOST = 10**8
-# Of a layer of a network.
+# Maximum width of a network layer.
 WIDEST = 1 << 16
 
 
 def check(settings: Any, called: Mapping[str, str] | None = None, **allowed: Allowed) -> None:
-    """Refuses settings outside their ranges.
+    """Check that settings are in their ranges.
 
     Args:
-      settings: an object with the attributes that are named.
-      called: attribute → what a message calls it, where that is not its name.
-      allowed: attribute → what it may be.
+      settings: an object with the attributes named in `allowed`.
+      called: attribute → its name in messages, if that is another name.
+      allowed: attribute → its range.
 
     Raises:
-      BadInput: the first that may not be what it is.
+      BadInput: an attribute is out of its range; the message names the first.
     """
     for name, what in allowed.items():
         check_value((called or {}).get(name, name), getattr(settings, name), what)
 
 
 def check_value(name: str, value: Any, allowed: Allowed) -> None:
-    """Refuses one value outside its range; `name` is what a message calls it."""
+    """Raise BadInput if a value is out of its range; `name` is its name in the message."""
     why = allowed(value)
     if why:
         raise BadInput(f"{name} {why}, not {value!r:.60}")
 
 
 def count(least: int = 1, most: int = MOST) -> Allowed:
-    """A whole number."""
+    """A whole number from `least` to `most`."""
 
     def refuse(x: Any) -> str | None:
         if isinstance(x, bool) or not hasattr(x, "__index__"):
@@ -55,13 +55,13 @@ def count(least: int = 1, most: int = MOST) -> Allowed:
 def number(
     low: float = -math.inf, high: float = math.inf, *, above: bool = False, below: bool = False
 ) -> Allowed:
-    """A finite number.
+    """A finite number between `low` and `high`.
 
     Args:
-      low: the least.
-      high: the greatest.
-      above: it must be above `low`.
-      below: it must be below `high`.
+      low: minimum.
+      high: maximum.
+      above: exclude `low`.
+      below: exclude `high`.
     """
     ends = ("(" if above or low == -math.inf else "[", ")" if below or high == math.inf else "]")
     interval = f"{ends[0]}{low:g}, {high:g}{ends[1]}".replace("inf", "∞").replace("-", "−")
@@ -78,23 +78,24 @@ def number(
 
 
 def seed() -> Allowed:
-    """A seed of 32 bits: jax would take 2³² for 0."""
+    """A 32-bit seed, because jax treats 2³² as 0."""
     return count(0, 2**32 - 1)
 
 
 def printable(x: Any) -> str | None:
-    """Text that may be printed: not blank, without line breaks or escape codes."""
+    """Printable text: not blank, without line breaks or escape codes."""
     good = isinstance(x, str) and x.strip() and x.isprintable()
-    return None if good else "must be text that can be printed"
+    return None if good else "must be printable text"
 
 
 def label(x: Any) -> str | None:
-    """Text that may be printed, and begin the name of a directory."""
-    return printable(x) or ("must name no path" if "/" in x or x.startswith(".") else None)
+    """Printable text that can also be the start of a directory name."""
+    why = 'must not contain "/" or start with "."'
+    return printable(x) or (why if "/" in x or x.startswith(".") else None)
 
 
 def shown(x: Any) -> str:
-    """A thing out of somebody's file as it may be printed: without line breaks or escape codes."""
+    """A value from a file as text that is safe to print: no line breaks or escape codes."""
     text = str(x)
     return text if text.isprintable() and len(text) <= 200 else f"{text!r:.200}"
 
@@ -112,12 +113,12 @@ def positive(high: float = math.inf) -> Allowed:
 
 
 def optional(allowed: Allowed) -> Allowed:
-    """None, or what is allowed."""
+    """None, or a value that `allowed` accepts."""
     return lambda x: None if x is None else allowed(x)
 
 
 def one_of(things: Collection[Any]) -> Allowed:
-    """One of some things, and of its type: 1 is not True."""
+    """One of the given values, with the same type: 1 is not True."""
 
     def refuse(x: Any) -> str | None:
         if any(type(x) is type(thing) and x == thing for thing in things):
@@ -128,7 +129,7 @@ def one_of(things: Collection[Any]) -> Allowed:
 
 
 def layers(x: Any) -> str | None:
-    """Widths of the hidden layers of a network."""
+    """A list of widths of hidden layers, each from 1 to WIDEST."""
     width = count(1, WIDEST)
     if not isinstance(x, tuple | list) or len(x) > 100:
         return "must be a list of at most 100 widths"

@@ -1,4 +1,4 @@
-"""What a run is made with: configs as JSON, and their digests."""
+"""Configs of runs as JSON, and their digests."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from genidm.errors import BadInput
 
 
 def to_json(config: Any) -> Any:
-    """A config as JSON can hold it.
+    """Convert a config to values that JSON supports.
 
-    Dataclasses become dicts that also name their `class`; tuples and arrays, lists; paths
-    and numbers that are not finite, strings; enums, functions and classes, their names (what a
-    function has captured is not seen). Modules are not named: a class that moves keeps its name.
+    Dataclasses become dicts with an extra key `class`. Tuples and arrays become lists. Paths, NaN
+    and infinity become strings. Enums, functions and classes become their names, without captured
+    variables, and without the module, so that a class can move.
 
     Raises:
-      BadInput: nothing tells a thing in it from others of its type.
+      BadInput: the config holds an object of another type.
     """
     if isinstance(config, enum.Enum):
         return f"{type(config).__qualname__}.{config.name}"
@@ -46,17 +46,17 @@ def to_json(config: Any) -> Any:
     if dataclasses.is_dataclass(config):
         values = {f.name: to_json(getattr(config, f.name)) for f in dataclasses.fields(config)}
         return {"class": type(config).__qualname__, **values}
-    raise BadInput(f"a {type(config).__name__} cannot stand in a config: {config!r:.80}")
+    raise BadInput(f"a {type(config).__name__} cannot be part of a config: {config!r:.80}")
 
 
 def digest(config: Any) -> str:
-    """Ten hex digits of the sha256 of the config's canonical JSON: its name in paths."""
+    """First ten hex digits of the SHA-256 of the config's canonical JSON, for directory names."""
     text = json.dumps(to_json(config), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """A nested dict as one: `{"a": {"b": 1}}` becomes `{"a.b": 1}`."""
+    """Flatten a nested dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`."""
     if not isinstance(tree, Mapping):
         return {prefix.removesuffix("."): tree}
     return {k: x for name, part in tree.items() for k, x in flat(part, f"{prefix}{name}.").items()}

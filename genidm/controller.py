@@ -1,4 +1,4 @@
-"""A controller: (s, goal − o) → a, the fitted models with all they need to be fed."""
+"""A controller (s, goal − o) → a: the fitted models and the preparation of their inputs."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 def in_frame(
     robot: Robot, input_frame: Frame, s: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """s `[..., S]` and d `[..., 3]` as a method sees them.
+    """Rotate s `[..., S]` and d `[..., 3]` into the input frame of a method.
 
-    In the "heading" frame the world is turned so that the robot faces +x: the input is
-    then exactly invariant to yaw, which is what the LFM learns in the limit.
+    In the "heading" frame the robot faces +x, so the input is exactly invariant to yaw (Def. 3).
+    An LFM learns this invariance approximately.
     """
     if input_frame == "world":
         return s, d
@@ -38,21 +38,21 @@ def in_frame(
 
 
 def direction(relative_goal: jax.Array) -> jax.Array:
-    """d, the unit vector of o' − o `[..., 3]` (Remark 2); zero where there is none."""
+    """Compute d, the unit vector of o' − o `[..., 3]` (Remark 2); zero if o' = o."""
     length = jnp.linalg.norm(relative_goal, axis=-1, keepdims=True)
     return relative_goal / jnp.maximum(length, 1e-6)
 
 
 class Controller(flax.struct.PyTreeNode):
-    """A fitted method: states and where to go in, actions out.
+    """A fitted method: (s, relative goal) → a.
 
     Attributes:
-      params: of the models.
-      mean: `[S]`, of the training states, in the method's input frame.
-      std: `[S]`.
+      params: parameters of the models.
+      mean: `[S]`, mean of the training states, in the method's input frame.
+      std: `[S]`, standard deviation of the training states.
       architecture: shape of the models.
-      input_frame: the frame that they see s and d in.
-      robot: the robot that they were fitted for.
+      input_frame: frame of the s and d that the models see.
+      robot: robot that the models are fitted for.
     """
 
     params: Any
@@ -63,33 +63,33 @@ class Controller(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
-        """Actions `[..., A]` in [−1, 1].
+        """Compute actions `[..., A]` in [−1, 1] from the current state and goal (Remark 1).
 
         Args:
           s: states `[..., S]`.
-          relative_goal: `[..., 3]`, from the robot to where it should go, metres.
+          relative_goal: `[..., 3]`, from the robot to its goal, metres.
 
         Raises:
-          BadInput: their shapes do not fit the robot, or each other.
+          BadInput: the shapes do not fit the robot or each other, or a number is not finite.
         """
         s = self.robot.check_inputs(s, relative_goal)
         s, d = in_frame(self.robot, self.input_frame, s, direction(relative_goal))
         return jnp.clip(self.action(self.latent(s, d)), -1.0, 1.0)
 
     def normalize(self, s: jax.Array) -> jax.Array:
-        """States by the statistics of the training data, kept within ±10."""
+        """Normalise states by the training statistics, and clip them to ±10."""
         return jnp.clip((s - self.mean) / self.std, -10.0, 10.0)
 
     def latent(self, s: jax.Array, d: jax.Array) -> jax.Array:
-        """γ `[..., k]` of states and directions in the method's input frame (Eq. 3)."""
+        """Compute γ `[..., k]` from s and d in the method's input frame (Eq. 3)."""
         return self.architecture.latent(self.params, self.normalize(s), d)
 
     def action(self, latent: jax.Array) -> jax.Array:
-        """φ(γ) `[..., A]`, not clipped (Eq. 4; Eq. 1 without an LFM)."""
+        """Compute φ(γ) `[..., A]`, not clipped (Eq. 4; Eq. 1 without an LFM)."""
         return self.architecture.action(self.params, latent)
 
     def fresh(self, key: jax.Array) -> dict[str, Any]:
-        """Parameters and statistics of the shapes that these have, not yet fitted."""
+        """Make unfitted parameters and statistics, with the same shapes as the fitted ones."""
         size = self.robot.observation.size
         return {
             "params": self.architecture.init(key, size),
@@ -98,10 +98,10 @@ class Controller(flax.struct.PyTreeNode):
         }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
-        """Writes the controller as a directory, without pickle.
+        """Write the controller as a directory, without pickle.
 
         Raises:
-          BadInput: there is something already, and `overwrite` is not set.
+          BadInput: the path exists, and `overwrite` is not set.
         """
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
@@ -113,10 +113,10 @@ class Controller(flax.struct.PyTreeNode):
 
     @classmethod
     def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Controller:
-        """The controller that `save` wrote, from what lies in its directory.
+        """Make a controller from the arrays and metadata that `save` wrote.
 
         Raises:
-          BadInput: what it says of its models cannot be.
+          BadInput: the metadata of the models is invalid.
         """
         for name, allowed in (
             ("action_size", count(robot.action.size, robot.action.size)),
@@ -131,43 +131,42 @@ class Controller(flax.struct.PyTreeNode):
 
 
 def pretrained(robot: str) -> Controller | Policy:
-    """A controller that comes with genidm: the best that was made for a robot of this name.
+    """Load the pretrained controller of a robot, the best one in our experiments.
 
-    Its directory, `genidm/pretrained/ROBOT`, says how: it is that of a run.
+    Its directory, `genidm/pretrained/ROBOT`, is that of its run and holds its settings.
 
     Args:
       robot: name of the robot.
 
     Raises:
-      BadInput: none comes for this robot.
+      BadInput: there is no pretrained controller for this robot.
     """
     if not (PRETRAINED / robot).is_dir():
-        there = ", ".join(sorted(path.name for path in PRETRAINED.iterdir()))
-        raise BadInput(f"no controller comes for {robot!r}; there are some for: {there}")
+        available = ", ".join(sorted(path.name for path in PRETRAINED.iterdir()))
+        raise BadInput(f"no pretrained controller for {robot!r}; available: {available}")
     return load(PRETRAINED / robot)
 
 
 def load(
     path: Path | str, robot: Robot | None = None, engine: str | None = None
 ) -> Controller | Policy:
-    """A saved controller, fitted or learned.
+    """Load a saved controller: a fitted Controller, or the Policy of a baseline.
 
     Args:
-      path: what `Controller.save` or `Policy.save` wrote, or the directory of the run
-        (METHOD-SEED-…) that it lies in.
-      robot: whose controller it is; found by its name among those that come with genidm,
-        unless given.
-      engine: to step that robot with, where none is given; the robot chooses, unless given.
+      path: directory that `Controller.save` or `Policy.save` wrote, or the directory of its
+        run (METHOD-SEED-…).
+      robot: robot of the controller; None finds a registered robot by its name.
+      engine: engine of the robot if `robot` is None; None takes the robot's default.
 
     Raises:
-      BadInput: the directory is corrupt, or the controller is another robot's.
+      BadInput: the directory is corrupt, or the controller is for another robot.
     """
     inside = Path(path) / "controller"
     place = inside if inside.is_dir() else Path(path)
     if place.exists() and not (place / files.MANIFEST).exists():
         raise BadInput(
-            f"{path} holds no controller: it lies in the directory of a fit or a baseline "
-            "(METHOD-SEED-…), once that is finished"
+            f"{path} holds no controller: a finished fit or baseline has it in its directory "
+            "(METHOD-SEED-…)"
         )
     tree, meta = files.load_arrays(place)
     if tree.keys() != {"params", "mean", "std"} or not isinstance(meta, dict):
@@ -188,13 +187,13 @@ def load(
 
 
 def _same_layouts(path: Path | str, meta: dict[str, Any], robot: Robot) -> None:
-    """Refuses a controller that was made for other numbers, or for the same in another order."""
+    """Refuse a controller whose layouts differ from the robot's in fields or order."""
     for name in ("observation", "action"):
-        there, here = meta.get(name), described(robot)[name]
-        if there != here:
+        saved, current = meta.get(name), described(robot)[name]
+        if saved != current:
             raise BadInput(
-                f"{path} was made for another {name} of the {robot.name}: {_fields(there)} there, "
-                f"{_fields(here)} here"
+                f"{path} is for another {name} of the {robot.name}: it has {_fields(saved)}; "
+                f"the robot has {_fields(current)}"
             )
 
 
@@ -209,9 +208,9 @@ def _fields(listed: Any) -> str:
 
 
 def _as_wanted(path: Path | str, found: Any, wanted: Any) -> None:
-    """Refuses parameters of other names, shapes or dtypes than the architecture's, or NaN."""
+    """Refuse parameters whose names, shapes or dtypes do not fit the architecture, and NaN."""
     if differs := trees.difference(trees.kinds(found), trees.kinds(wanted)):
-        name, there, here = differs
-        raise BadInput(f"{path}: {name} is {there}, where its architecture has {here}")
-    if broken := trees.not_finite(found):
-        raise BadInput(f"{path}: {broken} holds NaN or infinity")
+        name, saved, expected = differs
+        raise BadInput(f"{path}: {name} is {saved}, but its architecture needs {expected}")
+    if not_finite := trees.not_finite(found):
+        raise BadInput(f"{path}: {not_finite} holds NaN or infinity")

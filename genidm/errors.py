@@ -1,17 +1,17 @@
-"""What a user can mend: said in one sentence, without a traceback."""
+"""Errors that the user can correct: reported in one sentence, without a traceback."""
 
 import re
 
 
 class BadInput(Exception):
-    """Input that cannot be used. Commands print it to stderr and exit with status 2."""
+    """Invalid input. Commands print the message to stderr and exit with status 2."""
 
 
 def sentence(error: BaseException) -> str | None:
-    """What a user can mend of an error that jax has wrapped in one of its own; None if nothing.
+    """Message for a jax error that wraps BadInput or reports lack of memory; None for others.
 
-    A program that calls the host (`jax.pure_callback`) gives an error of jax, with the BadInput
-    that was raised there as a line of its text.
+    If a host callback (`jax.pure_callback`) raises BadInput, jax raises its own error, whose
+    text contains the BadInput in one line.
     """
     text = str(error)
     if found := re.search(rf"^(?:\S+\.)?{BadInput.__name__}: (.+)$", text, re.MULTILINE):

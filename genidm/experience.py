@@ -1,4 +1,4 @@
-"""Experience (Def. 1): what a robot did while it learned something else."""
+"""Experience (Def. 1): the recorded steps of a robot that learns another task."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from genidm.files import Corrupt
 from genidm.robots.base import Robot
 from genidm.tasks import Transition
 
-# Metres; farther off, float32 rounds a position by more than 0.01 mm.
+# Metres; at larger distances, float32 rounds a position by more than 0.01 mm.
 FAR = 100.0
 
 
 class Experience(flax.struct.PyTreeNode):
-    """Recorded transitions, T steps of B lanes, in the order they happened.
+    """Recorded transitions: T steps of B lanes, in time order.
 
     Attributes:
       s: `[T, B, S]`, state before the step.
       o: `[T, B, 3]`, position before the step, metres, world frame.
-      o_next: `[T, B, 3]`, position after it, before any reset.
+      o_next: `[T, B, 3]`, position after the step, before any reset.
       a: `[T, B, A]`, action in [−1, 1].
       first: `[T, B]` bool, the first step of an episode.
       last: `[T, B]` bool, the last step of an episode.
       valid: `[T, B]` bool, False where the physics diverged in the step.
-      physics: tree `[T, B, ...]`, physics before the step, or None for a log that has
-        none: it can be rotated exactly (`Generalize(mode="rotate")`), but not replayed.
+      physics: tree `[T, B, ...]`, physics before the step; None for a log without physics,
+        which can be rotated (`Generalize(mode="rotate")`), but not replayed.
     """
 
     s: Any
@@ -57,73 +57,76 @@ class Experience(flax.struct.PyTreeNode):
         return jax.tree.map(lambda x: x[:steps], self)
 
     def first_half(self) -> Experience:
-        """What GE and LR learn from (A.1.2)."""
+        """The first half of the record, from which GE and LR learn (A.1.2)."""
         return self.first_fraction(0.5)
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
-        """Writes the record as a directory of arrays, without pickle.
+        """Write the record as a directory of arrays, without pickle.
 
         Raises:
-          BadInput: there is a record already, and `overwrite` is not set; or one of its valid
-            steps holds what is not finite.
+          BadInput: the path exists, and `overwrite` is False; the arrays have different [T, B];
+            or a valid step holds NaN or infinity.
         """
-        made = jax.tree.map(_plain, _named(self))
-        lanes = made.first.shape
-        if any(x.shape[:2] != lanes for x in jax.tree.leaves(made)):
-            raise BadInput(f"experience: not all arrays are of {lanes} steps and lanes")
-        _finite(_cleared(made))
+        made = jax.tree.map(_as_numpy, _lists_as_arrays(self))
+        shape = made.first.shape
+        if any(x.shape[:2] != shape for x in jax.tree.leaves(made)):
+            raise BadInput(f"experience: not all arrays begin with the shape {shape} of first")
+        _check_finite(_zero_invalid(made))
         tree = flax.serialization.to_state_dict(made)
-        there = {name: x for name, x in tree.items() if x is not None}
-        files.save_arrays(path, there, {}, overwrite)
+        arrays = {name: x for name, x in tree.items() if x is not None}
+        files.save_arrays(path, arrays, {}, overwrite)
 
     @property
     def ends(self) -> np.ndarray:
-        """`[T, B]` bool, where an episode ends: it says so, or the next step begins one."""
+        """`[T, B]` bool, the last step of an episode: `last`, or the next step is `first`."""
         last, first = np.asarray(self.last), np.asarray(self.first)
         return last | np.concatenate([first[1:], np.zeros_like(first[:1])])
 
     @property
     def begins(self) -> np.ndarray:
-        """`[T, B]` bool, where an episode begins, or the record does."""
+        """`[T, B]` bool, the first step of an episode or of the record."""
         ends = self.ends
         return np.concatenate([np.ones_like(ends[:1]), ends[:-1]])
 
     def prepared(self, robot: Robot) -> Experience:
-        """The record as 𝒢 and a fit can use it: NumPy arrays, and s as controllers are fed it.
+        """Check the record and convert it for 𝒢 and a fit: NumPy arrays with the canonical s.
 
-        Steps that are not `valid` are not looked at: what they hold is set to zero. Positions
-        that float32 would round (UTM), without physics to be replayed from, count from the start
-        of each episode; that is subtracted in the precision that they come in.
+        Steps that are not `valid` are not checked, and become zero. In a log without physics,
+        large positions (UTM) become relative to the start of their episode, before the conversion
+        to float32.
 
         Raises:
-          BadInput: the shapes do not fit together or the robot, or what a valid step holds cannot
-            be: numbers that are not finite, actions outside [−1, 1], an orientation that is none,
-            positions that jump, episodes that begin where none has ended.
+          BadInput: the shapes do not fit each other or the robot, or a valid step is impossible:
+            NaN or infinity, an action outside [−1, 1], an invalid orientation, a position that
+            jumps, or `first` without `last` in the step before; or a log has neither.
         """
-        made = _numbers(jax.tree.map(_plain, _named(self)))
-        _fitting(made, robot)
-        clean = _cleared(made)
-        _finite(clean)
-        _possible(clean, robot)
-        _continuous(clean, robot)
-        _read_otherwise(clean, robot)
+        if isinstance(self, Prepared) and self.robot == robot.name:
+            return self
+        made = _as_floats(jax.tree.map(_as_numpy, _lists_as_arrays(self)))
+        _check_shapes(made, robot)
+        clean = _zero_invalid(made)
+        _check_finite(clean)
+        _check_ranges(clean, robot)
+        _check_continuous(clean, robot)
+        _check_orientation(clean, robot)
         if clean.far_away:
             clean = clean.centred()
         narrow = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, clean)
         s = np.asarray(robot.observation.canonical(jnp.asarray(narrow.s)))
-        return narrow.replace(s=s.astype(np.float32, copy=False))
+        fields = {f.name: getattr(narrow, f.name) for f in dataclasses.fields(Experience)}
+        return Prepared(**fields | {"s": s.astype(np.float32, copy=False)}, robot=robot.name)
 
     @property
     def far_away(self) -> bool:
-        """Whether positions are to be counted from the start of each episode."""
+        """Whether positions are too large for float32, and there is no physics to replay."""
         return self.physics is None and bool(np.abs(np.asarray(self.o)[self.valid]).max() > FAR)
 
     def centred(self) -> Experience:
-        """Positions that count from the start of each episode, horizontally."""
+        """The record with horizontal positions relative to the start of each episode."""
         o = np.asarray(self.o, np.float64)
         rows = np.arange(len(o))[:, None]
         start = np.maximum.accumulate(np.where(self.begins, rows, 0), axis=0)
-        # The first step that is valid: what others hold is nothing to count from.
+        # Use the first valid step of the episode, because invalid steps hold no position.
         valid = np.where(np.asarray(self.valid), rows, len(o) - 1)
         valid = np.minimum.accumulate(valid[::-1], axis=0)[::-1]
         first = np.take_along_axis(valid, start, axis=0)
@@ -131,25 +134,45 @@ class Experience(flax.struct.PyTreeNode):
         return self.replace(o=o - origin, o_next=np.asarray(self.o_next) - origin)
 
 
-def _plain(x: Any) -> np.ndarray:
-    """An array as NumPy computes with it, of this machine's byte order."""
+class Prepared(Experience):
+    """The result of `Experience.prepared`, which is not checked a second time.
+
+    Attributes:
+      robot: name of the robot that the record was checked for.
+    """
+
+    robot: str = flax.struct.field(pytree_node=False, default="")
+
+
+def _changed(prepared: Prepared, **changes: Any) -> Experience:
+    """Replace fields; the result is an Experience, so that it is checked again."""
+    fields = {f.name: getattr(prepared, f.name) for f in dataclasses.fields(Experience)}
+    return Experience(**fields | changes)
+
+
+# Set after the class body, because flax then adds its own `replace`.
+setattr(Prepared, "replace", _changed)  # noqa: B010  mypy rejects a plain assignment
+
+
+def _as_numpy(x: Any) -> np.ndarray:
+    """Convert an array to a numeric NumPy array with this machine's byte order."""
     if isinstance(x, np.ma.MaskedArray):
         if np.ma.is_masked(x):
-            raise BadInput("experience: an array is masked: mark those steps as not valid")
+            raise BadInput("experience: an array is masked: set valid = False for the masked steps")
         x = x.data
     try:
         array = np.asarray(x)
         if array.dtype == object:
             array = np.asarray(array.tolist(), np.float64)
     except (TypeError, ValueError):
-        raise BadInput("experience: an array holds something else than numbers") from None
+        raise BadInput("experience: an array holds something other than numbers") from None
     if array.dtype.kind not in "biuf":
-        raise BadInput(f"experience: an array holds {array.dtype}, not numbers")
+        raise BadInput(f"experience: an array has dtype {array.dtype}, not numbers")
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def _numbers(made: Experience) -> Experience:
-    """The record with floats of 32 or 64 bits: integers and half floats reckon otherwise."""
+def _as_floats(made: Experience) -> Experience:
+    """Convert integers and half floats to float64, because their arithmetic is not exact enough."""
     wide = {
         name: x.astype(np.float64)
         for name in ("s", "o", "o_next", "a")
@@ -158,51 +181,54 @@ def _numbers(made: Experience) -> Experience:
     return made.replace(**wide)
 
 
-def _named(experience: Experience) -> Experience:
-    """The record with lists, which are trees to jax, as arrays."""
-    lists = {
+def _lists_as_arrays(experience: Experience) -> Experience:
+    """Convert lists to arrays, because jax treats lists as trees."""
+    arrays = {
         f.name: np.asarray(x) if isinstance(x, list | tuple) else x
-        for f in dataclasses.fields(experience)
+        for f in dataclasses.fields(Experience)
         if (x := getattr(experience, f.name)) is not None or f.name == "physics"
     }
-    return experience.replace(**lists)
+    return experience.replace(**arrays)
 
 
-def _cleared(made: Experience) -> Experience:
-    """The record with zeros in the steps that are not valid."""
+def _zero_invalid(made: Experience) -> Experience:
+    """Set all numbers of invalid steps to zero."""
     valid = made.valid
     if valid.all():
         return made
 
     def clear(x: np.ndarray) -> np.ndarray:
-        there = valid.reshape(valid.shape + (1,) * (x.ndim - 2))
-        return x if x.dtype == bool else np.where(there, x, np.zeros_like(x))
+        mask = valid.reshape(valid.shape + (1,) * (x.ndim - 2))
+        return x if x.dtype == bool else np.where(mask, x, np.zeros_like(x))
 
     return jax.tree.map(clear, made)
 
 
-def _fitting(made: Experience, robot: Robot) -> None:
-    """Refuses shapes and flags that do not fit together, or the robot."""
-    lanes = made.first.shape
-    if len(lanes) != 2:
-        raise BadInput(f"experience: first has shape {lanes}, not that of [steps, lanes]")
-    if 0 in lanes:
-        raise BadInput(f"experience: the record is empty: it has {lanes} steps and lanes")
+def _check_shapes(made: Experience, robot: Robot) -> None:
+    """Raise BadInput if shapes or dtypes do not fit each other or the robot."""
+    steps_lanes = made.first.shape
+    if len(steps_lanes) != 2:
+        raise BadInput(f"experience: first has shape {steps_lanes}, expected [steps, lanes]")
+    if 0 in steps_lanes:
+        raise BadInput(f"experience: the record is empty: first has shape {steps_lanes}")
     sizes = {"s": (robot.observation.size,), "o": (3,), "o_next": (3,), "a": (robot.action.size,)}
     for name, size in (sizes | {"last": (), "valid": ()}).items():
         shape = getattr(made, name).shape
-        if shape != (*lanes, *size):
-            raise BadInput(f"experience: {name} has shape {shape}, not {(*lanes, *size)}")
+        if shape != (*steps_lanes, *size):
+            expected = (*steps_lanes, *size)
+            raise BadInput(f"experience: {name} has shape {shape}, expected {expected}")
     for name in ("first", "last", "valid"):
         if getattr(made, name).dtype != bool:
-            raise BadInput(f"experience: {name} is of {getattr(made, name).dtype}, not bool")
-    if any(x.shape[:2] != lanes for x in jax.tree.leaves(made.physics)):
-        raise BadInput(f"experience: physics is not of {lanes} steps and lanes")
+            raise BadInput(
+                f"experience: {name} has dtype {getattr(made, name).dtype}, expected bool"
+            )
+    if any(x.shape[:2] != steps_lanes for x in jax.tree.leaves(made.physics)):
+        raise BadInput(f"experience: physics does not begin with the shape {steps_lanes} of first")
     if not made.valid.any():
         raise BadInput("experience: no step is valid")
 
 
-def _finite(clean: Experience) -> None:
+def _check_finite(clean: Experience) -> None:
     for name in ("s", "o", "o_next", "a", "physics"):
         for x in jax.tree.leaves(getattr(clean, name)):
             if not np.isfinite(x).all():
@@ -210,8 +236,8 @@ def _finite(clean: Experience) -> None:
                 raise BadInput(f"experience: {name} holds NaN or infinity, first in [{t}, {lane}]")
 
 
-def _possible(clean: Experience, robot: Robot) -> None:
-    """Refuses actions and states that the robot cannot have."""
+def _check_ranges(clean: Experience, robot: Robot) -> None:
+    """Raise BadInput for actions and states that the robot cannot have."""
     if np.abs(clean.a).max() > 1 + 1e-6:
         t, lane = np.argwhere(np.abs(clean.a) > 1 + 1e-6)[0][:2]
         raise BadInput(f"experience: a lies outside [−1, 1], first in [{t}, {lane}]")
@@ -220,20 +246,22 @@ def _possible(clean: Experience, robot: Robot) -> None:
         raise BadInput(f"experience: {invalid} (s)")
 
 
-def _continuous(clean: Experience, robot: Robot) -> None:
-    """Refuses flags and positions that contradict each other, or a robot that is carried away."""
+def _check_continuous(clean: Experience, robot: Robot) -> None:
+    """Raise BadInput if `first` and `last` contradict each other, or a position jumps."""
     both = clean.valid[1:] & clean.valid[:-1]
     for wrong, what in (
-        (both & clean.first[1:] & ~clean.last[:-1], "begins an episode, where none has ended"),
-        (both & ~clean.first[1:] & clean.last[:-1], "begins none, where one has ended"),
+        (both & clean.first[1:] & ~clean.last[:-1], "first, but the step before it is not last"),
+        (both & ~clean.first[1:] & clean.last[:-1], "not first, but the step before it is last"),
     ):
         if wrong.any():
             t, lane = np.argwhere(wrong)[0]
-            raise BadInput(f"experience: step [{t + 1}, {lane}] {what} (first, last)")
-    if clean.physics is not None:  # a simulation knows where its robots are
+            raise BadInput(f"experience: step [{t + 1}, {lane}] is {what}")
+    if clean.physics is not None:  # only logs have measured positions, which can jump
         return
+    if not (clean.first | clean.last).any():
+        raise BadInput("experience: no step is marked as the first or the last of an episode")
     step = np.linalg.norm(clean.o_next - clean.o, axis=-1)
-    # Not all of the steps: where a position is put right each second, two in a hundred are jumps.
+    # Not the maximum: if a position is corrected every second, 2 % of the steps are jumps.
     usual = np.quantile(step[clean.valid], 0.9)
     most = max(10 * usual, 5.0 * robot.dt)
     gap, steps = _gaps(clean)
@@ -243,54 +271,55 @@ def _continuous(clean: Experience, robot: Robot) -> None:
             t, lane = np.unravel_index(beyond.argmax(), jump.shape)
             raise BadInput(
                 f"experience: the position jumps by {beyond.max():.3g} m to {name} [{t}, {lane}], "
-                f"where 90 % of the steps are below {usual:.2g} m: end the episode there, or mark "
-                "the step as not valid"
+                f"but 90 % of the steps are below {usual:.2g} m. End the episode there, or set "
+                "valid = False for the step"
             )
 
 
 def _gaps(clean: Experience) -> tuple[np.ndarray, np.ndarray]:
-    """Metres from where the step before ended `[T, B]`, and how many steps before that was.
+    """Metres `[T, B]` from the previous valid step's o_next to o, and how many steps ago it was.
 
-    The step before is the last valid one of the episode; without one the distance is 0.
+    Without a previous valid step in the episode, the distance is 0.
     """
     rows = np.arange(len(clean.o))[:, None]
-    before = np.maximum.accumulate(np.where(clean.valid, rows, -1), axis=0)
-    before = np.concatenate([np.full_like(before[:1], -1), before[:-1]])
+    previous = np.maximum.accumulate(np.where(clean.valid, rows, -1), axis=0)
+    previous = np.concatenate([np.full_like(previous[:1], -1), previous[:-1]])
     episode = np.cumsum(clean.begins, axis=0)
-    at = np.maximum(before, 0)
-    same = (before >= 0) & (np.take_along_axis(episode, at, axis=0) == episode) & clean.valid
-    there = np.take_along_axis(clean.o_next, at[..., None], axis=0)
-    return np.linalg.norm(clean.o - there, axis=-1) * same, rows - before
+    at = np.maximum(previous, 0)
+    same = (previous >= 0) & (np.take_along_axis(episode, at, axis=0) == episode) & clean.valid
+    o_next = np.take_along_axis(clean.o_next, at[..., None], axis=0)
+    return np.linalg.norm(clean.o - o_next, axis=-1) * same, rows - previous
 
 
-def _read_otherwise(clean: Experience, robot: Robot) -> None:
-    """Refuses an orientation that fits the way that a robot goes only where it is read otherwise.
+def _check_orientation(clean: Experience, robot: Robot) -> None:
+    """Raise BadInput if headings fit the motion only in another unit or quaternion order.
 
-    Degrees that turn slowly, or (x, y, z, w) of a robot that leans to one side, are numbers that
-    radians and (w, x, y, z) might be. A robot that faces where it goes tells them apart.
+    The numbers alone do not show it: slow turns in degrees can look like radians, and (x, y, z, w)
+    of a robot that leans to one side can look like (w, x, y, z). But most robots walk in the
+    direction of their heading.
     """
-    way = (clean.o_next - clean.o)[clean.valid]
-    moves = np.linalg.norm(way[:, :2], axis=-1)
-    moves = moves > 0.1 * moves.max()
-    course = np.arctan2(way[:, 1], way[:, 0])[moves]
+    displacement = (clean.o_next - clean.o)[clean.valid]
+    distance = np.linalg.norm(displacement[:, :2], axis=-1)
+    moves = distance > 0.1 * distance.max()
+    course = np.arctan2(displacement[:, 1], displacement[:, 0])[moves]
     for field, part in zip(
         robot.observation.fields, robot.observation.parts(clean.s[clean.valid][moves]), strict=True
     ):
         if field.otherwise is None or field.yaw is None or not len(course):
             continue
-        read, words = field.otherwise
-        other = read(part)
+        convert, words = field.otherwise
+        other = convert(part)
         if other is None:
             continue
-        here, there = (
+        as_given, converted = (
             np.cos(np.asarray(field.yaw(jnp.asarray(x))) - course).mean() for x in (part, other)
         )
-        if here < 0.5 and there > 0.9:
-            raise BadInput(f"experience: {field.name!r} fits the way of the robot {words} (s)")
+        if as_given < 0.5 and converted > 0.9:
+            raise BadInput(f"experience: {field.name!r} fits the robot's motion only {words} (s)")
 
 
 def record(step: Transition) -> Experience:
-    """The experience in one transition of B lanes, arrays `[B, ...]`."""
+    """Convert one transition of B lanes to Experience, arrays `[B, ...]`."""
     return Experience(
         s=step.before.observation,
         o=step.before.position,
@@ -304,37 +333,37 @@ def record(step: Transition) -> Experience:
 
 
 def concatenate(parts: list[Experience]) -> Experience:
-    """Records that follow one another in time, as one, on the host."""
+    """Join records along time, on the host."""
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(p) for p in x]), *parts)
 
 
 def load(path: Path | str, robot: Robot) -> Experience:
-    """A record that `Experience.save` wrote.
+    """Load a record that `Experience.save` wrote.
 
     Raises:
-      BadInput: the directory is corrupt, or the record is another robot's.
+      BadInput: the directory is corrupt, or the record does not fit the robot.
     """
     tree, _ = files.load_arrays(path)
     if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
-        raise BadInput(f"{path} holds no experience")
+        raise BadInput(f"{path} does not hold an experience")
     experience = Experience(**tree)
-    _fitting(experience, robot)
+    _check_shapes(experience, robot)
     if experience.physics is None:
         return experience
     try:
         physics = flax.serialization.from_state_dict(robot.physics, experience.physics)
     except ValueError:
-        raise BadInput(f"{path} holds the physics of another robot than {robot.name}") from None
+        raise BadInput(f"{path} holds the physics of another robot, not {robot.name}") from None
     return experience.replace(physics=physics)
 
 
 def load_chunks(directory: Path, robot: Robot, interactions: int | None = None) -> Experience:
-    """The record that `collect` wrote in chunks.
+    """Load the record that `collect` wrote in chunks.
 
     Args:
-      directory: where they lie.
-      robot: whose record it is.
-      interactions: how many there must be; as many as there are, unless given.
+      directory: the directory of the chunks.
+      robot: the robot of the record.
+      interactions: expected number of interactions; None: any number.
 
     Raises:
       BadInput: a chunk is corrupt, or missing.
@@ -350,17 +379,17 @@ def load_chunks(directory: Path, robot: Robot, interactions: int | None = None) 
 
 
 def goal_step(last: jax.Array, goal_horizon: int) -> tuple[jax.Array, jax.Array]:
-    """Where the intermediate goal o' of each step (Def. 1) lies: `goal_horizon` − 1 steps later.
+    """Index of the step `goal_horizon` − 1 later; its o_next is the intermediate goal o' (Def. 1).
 
-    A step whose episode, or record, ends before that has no such goal. So what led to a fall
-    within the goal horizon is not taken for a way to go anywhere.
+    A step has no goal if its episode, or the record, ends earlier. So no action that leads to a
+    fall within the goal horizon becomes a sample.
 
     Args:
       last: `[T, B]` bool, the last step of an episode.
       goal_horizon: steps, at least 1; 1 is the paper's "next position".
 
     Returns:
-      the step `[T, B]` whose outcome is o', and whether there is one, `[T, B]` bool.
+      the indices `[T, B]` in the first dimension, and whether the goal exists, `[T, B]` bool.
     """
     steps = last.shape[0]
     time = jnp.arange(steps)[:, None]

@@ -1,6 +1,6 @@
-"""The one step loop: robots step under whatever acts, and whatever watches sees each step.
+"""The step loop: `act` chooses the actions, and `watch` reads each step.
 
-Collecting, 𝒢, the test and waypoints are this loop with an `act` and a `watch` of their own.
+Collection, 𝒢, the test and waypoints use this loop, each with its own `act` and `watch`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from genidm.robots.base import Robot, State
 
 
 class Move(NamedTuple):
-    """One control step of B robots.
+    """One environment step of B robots.
 
     Attributes:
-      before: State `[B]` that the action was chosen in.
+      before: State `[B]` before the step.
       action: `[B, A]`.
-      after: State `[B]` that it led to.
-      notes: what `act` wants `watch` to know beside.
+      after: State `[B]` after the step.
+      notes: anything else that `act` passes to `watch`.
     """
 
     before: State
@@ -31,9 +31,9 @@ class Move(NamedTuple):
 
 
 def narrow(tree: Any) -> Any:
-    """A tree whose float64 is float32: where jax is told to compute with 64 bits, records are not.
+    """Convert float64 arrays of a tree to float32.
 
-    Robots that name no dtypes have states of float64 then.
+    With `jax_enable_x64`, some robots have float64 states; records stay float32.
     """
 
     def leaf(x: Any) -> Any:
@@ -42,27 +42,27 @@ def narrow(tree: Any) -> Any:
     return jax.tree.map(leaf, tree)
 
 
-# (carry, row) → where the robots are, a [B, A], and notes.
+# (carry, row) → State before the step, a [B, A], and notes.
 Act = Callable[[Any, Any], tuple[State, jax.Array, Any]]
-# (carry, move) → the carry after the step, and what is kept of it.
+# (carry, move) → the carry after the step, and the output for the step.
 Watch = Callable[[Any, Move], tuple[Any, Any]]
 
 
 def rollout(
     robot: Robot, act: Act, watch: Watch, carry: Any, rows: Any = None, steps: int | None = None
 ) -> tuple[Any, Any]:
-    """Steps B robots, inside a jitted program.
+    """Step B robots T times, inside a jitted program.
 
     Args:
-      robot: what steps.
-      act: says where the robots are (it may put them somewhere else first) and what they do.
-      watch: takes each step in.
-      carry: what goes from one step to the next; a tree of arrays.
-      rows: tree `[T, ...]`, one row a step for `act`; None if it needs none.
-      steps: T, where there are no rows.
+      robot: the robot.
+      act: returns the State to step from (it may differ from the last one) and the actions.
+      watch: returns the next carry and the output for each step.
+      carry: the loop state, a tree of arrays.
+      rows: tree `[T, ...]` with one row per step for `act`; None if `act` needs no rows.
+      steps: T, if there are no rows.
 
     Returns:
-      the carry after T steps, and what `watch` kept, stacked `[T, ...]`.
+      the carry after T steps, and the outputs of `watch`, stacked `[T, ...]`.
     """
 
     def step(carry: Any, row: Any) -> tuple[Any, Any]:

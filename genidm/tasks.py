@@ -1,7 +1,7 @@
-"""What a robot is rewarded for, and when its episode ends, over any Robot.
+"""Tasks: the reward of a step and the end of an episode, for any Robot.
 
-Collecting rewards walking one way (A.1.1): forward velocity, a bonus for staying up,
-minus control and contact costs. The baselines are rewarded for walking to a goal.
+Collection rewards walking forward (A.1.1): forward velocity and a bonus for not falling,
+minus control and contact costs. The baselines get a reward for walking to a goal.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from genidm.symmetry import horizontal_norm
 
 
 class EnvState(flax.struct.PyTreeNode):
-    """B robots in the middle of their episodes.
+    """The state of B environments.
 
     Attributes:
-      robots: their State.
+      robots: State `[B]`.
       episode_step: `[B]` int32, steps since the episode began.
-      keys: `[B]`, one random stream a lane, so that results do not depend on sharding.
-      goal: `[B, 3]`, metres, world frame; None where the task has no goals.
+      keys: `[B]`, one random key per lane, so that results do not depend on sharding.
+      goal: `[B, 3]`, metres, world frame; None if the task has no goals.
     """
 
     robots: State
@@ -36,18 +36,18 @@ class EnvState(flax.struct.PyTreeNode):
 
     @property
     def relative_goal(self) -> Any:
-        """From the robots to their goals `[B, 3]`, metres; None where the task has none."""
+        """Vectors `[B, 3]` from robots to goals, metres; None if the task has no goals."""
         return None if self.goal is None else self.goal - self.robots.position
 
 
 class Outcome(NamedTuple):
-    """What a task makes of a step, `[...]` each.
+    """The task's result of a step, `[...]` each.
 
     Attributes:
-      reward: of the step.
-      terminal: bool, the episode ends here for good.
-      absorbing_reward: reward of each step for ever after a terminal one. A robot that has fallen
-        is not let off: what it would be charged if it lay there stands here.
+      reward: reward of the step.
+      terminal: bool, the episode ends here, but not by the time limit.
+      absorbing_reward: reward of every step after a terminal step, for ever. So the value of a
+        fall includes the negative rewards that would follow.
     """
 
     reward: jax.Array
@@ -56,18 +56,18 @@ class Outcome(NamedTuple):
 
 
 class Transition(flax.struct.PyTreeNode):
-    """One transition of B lanes, before any reset; what learners and records read.
+    """One transition of B lanes, before any reset; learners and records read it.
 
     Attributes:
-      before: State `[B]` that the action was chosen in.
+      before: State `[B]` before the step.
       action: a `[B, A]`.
-      after: State `[B]` that it led to.
-      goal: `[B, 3]`, metres, world frame; None where the task has no goals.
+      after: State `[B]` after the step.
+      goal: `[B, 3]`, metres, world frame; None if the task has no goals.
       reward: `[B]`.
       absorbing_reward: `[B]`, see `Outcome`.
-      episode_step: `[B]` int32, steps of the episode before this one.
-      terminal: `[B]` bool, the robot fell, arrived, or its physics diverged.
-      last: `[B]` bool, the episode ended here: terminal, or at the time limit.
+      episode_step: `[B]` int32, steps of the episode before this step.
+      terminal: `[B]` bool, the robot fell or reached the goal, or its physics diverged.
+      last: `[B]` bool, the last step of an episode: terminal, or at the time limit.
     """
 
     before: State
@@ -82,39 +82,39 @@ class Transition(flax.struct.PyTreeNode):
 
     @property
     def first(self) -> jax.Array:
-        """`[B]` bool, `before` is the start of an episode."""
+        """`[B]` bool, the first step of an episode."""
         return self.episode_step == 0
 
 
 class Task(Protocol):
-    """What an agent learns: settings, as a frozen dataclass.
+    """The interface of a task; tasks are frozen dataclasses of settings.
 
     Attributes:
-      goal_conditioned: whether there are goals.
+      goal_conditioned: whether the task has goals.
     """
 
     goal_conditioned: ClassVar[bool]
 
     def start(self, robot: Robot, keys: jax.Array) -> EnvState:
-        """EnvState `[B]` at the start of fresh episodes."""
+        """EnvState `[B]` at the start of new episodes, from keys `[B]`."""
 
     def transition(
         self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
     ) -> Transition:
-        """What a step of every lane under `[B, A]`, which led to `after`, is worth."""
+        """The transition `[B]` from `lanes` under `action [B, A]` to `after`, with its reward."""
 
     def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
-        """What is worth a learning curve, `[B]` each."""
+        """Metrics of a step for the learning curves, `[B]` each."""
 
 
 @dataclasses.dataclass(frozen=True)
 class WalkForward:
-    """Walk towards +x for as long as you stand.
+    """The task to walk towards +x without a fall (A.1.1).
 
     Attributes:
-      episode_steps: the time limit.
-      start_yaw: radians; starts are turned by a yaw drawn from ± this. 0 is the paper's:
-        every episode starts facing +x.
+      episode_steps: time limit of an episode, in steps.
+      start_yaw: radians; the initial yaw is uniform in ± this value. 0, as in the paper: every
+        episode starts facing +x.
     """
 
     episode_steps: int = 1000
@@ -144,14 +144,14 @@ class WalkForward:
 
 
 class GoalStep(NamedTuple):
-    """A step towards a goal, as far as its reward depends on it, `[...]` each.
+    """The quantities that the reward of a step to a goal depends on, `[...]` each.
 
     Attributes:
-      before: metres to the goal before the step, horizontally.
-      after: metres after it.
+      before: horizontal distance to the goal before the step, metres.
+      after: horizontal distance to the goal after the step, metres.
       cost: control and contact costs.
-      fallen: bool.
-      reached: bool.
+      fallen: bool, the robot fell, or its physics diverged.
+      reached: bool, the goal is within the goal radius.
     """
 
     before: jax.Array
@@ -163,10 +163,10 @@ class GoalStep(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ProgressReward:
-    """Of VGCP: the robot "is encouraged to move in the direction of the goal" (A.1.1).
+    """Reward of VGCP: the robot "is encouraged to move in the direction of the goal" (A.1.1).
 
-    The walking reward, with the speed towards the goal in place of the forward speed. Who
-    has arrived stands there for ever, so that it is not better to keep away.
+    It is the walking reward with the speed towards the goal instead of the forward speed. At the
+    goal, the absorbing reward is the healthy reward; otherwise it would pay to stay away.
     """
 
     def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
@@ -177,7 +177,7 @@ class ProgressReward:
 
 @dataclasses.dataclass(frozen=True)
 class Sparse:
-    """Of HER-Sparse: "0 if it reaches the goal, and −1 otherwise" (A.1.1)."""
+    """Reward of HER-Sparse: "0 if it reaches the goal, and −1 otherwise" (A.1.1)."""
 
     def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
         reward = jnp.where(step.reached, 0.0, -1.0)
@@ -186,11 +186,11 @@ class Sparse:
 
 @dataclasses.dataclass(frozen=True)
 class Dense:
-    """Of HER-Dense: "a weighted sum of distance to the goal and contact and control costs".
+    """Reward of HER-Dense: minus "a weighted sum of distance to the goal and [...] costs" (A.1.1).
 
     Attributes:
-      distance: weight of a metre.
-      cost: weight of the costs.
+      distance: weight of the distance, per metre.
+      cost: weight of the contact and control costs.
     """
 
     distance: float = 1.0
@@ -200,22 +200,23 @@ class Dense:
         check(self, distance=number(0), cost=number(0))
 
     def __call__(self, robot: Robot, step: GoalStep) -> tuple[jax.Array, jax.Array]:
-        far = jnp.where(step.reached, 0.0, -self.distance * step.after)
-        return far - self.cost * step.cost, far
+        absorbing = jnp.where(step.reached, 0.0, -self.distance * step.after)
+        return absorbing - self.cost * step.cost, absorbing
 
 
 @dataclasses.dataclass(frozen=True)
 class GoToGoal:
-    """Walk to a goal; start, heading and goal are drawn afresh for every episode.
+    """The task to walk to a goal; every episode has a new start, heading and goal.
 
-    Goals lie as in the paper's test (A.1.3): no baseline is asked for what it never saw.
+    Goals have the distribution of the paper's test (A.1.3), so that the baselines train on
+    what they are tested on.
 
     Attributes:
-      reward: of a step.
-      episode_steps: the time limit.
-      start_yaw: radians; starts are turned by a yaw drawn from ± this.
-      bearing: radians; goals lie within ± this of the heading.
-      goal_radius: metres; nearer is reached, and ends the episode.
+      reward: the reward function.
+      episode_steps: time limit of an episode, in steps.
+      start_yaw: radians; the initial yaw is uniform in ± this value.
+      bearing: radians; the bearing of the goal from the heading is uniform in ± this value.
+      goal_radius: metres; within this distance the goal is reached and the episode ends.
     """
 
     reward: ProgressReward | Sparse | Dense = ProgressReward()
@@ -253,10 +254,9 @@ class GoToGoal:
         cost: jax.Array,
         fallen: jax.Array,
     ) -> Outcome:
-        """What a step from `o` to `o_next` `[..., 3]` is worth on the way to `goal`.
+        """Outcome `[...]` of a step from `o` to `o_next` `[..., 3]` with the goal `goal [..., 3]`.
 
-        A function of what a replay buffer holds, so that a relabelled step is judged as if
-        it had been made for its new goal.
+        All arguments are in the replay buffer, so HER can compute the outcome for a new goal.
         """
         after = horizontal_norm(goal - o_next)
         reached = after <= self.goal_radius
@@ -274,18 +274,18 @@ class GoToGoal:
         return to_transition(lanes, action, after, outcome, self.episode_steps)
 
     def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
-        """Speed towards the goal in m/s, arrivals, reward, falls, divergences."""
+        """Speed towards the goal in m/s, goals reached, reward, falls, divergences."""
         before, after = (horizontal_norm(step.goal - x.position) for x in (step.before, step.after))
         speed = (before - after) / robot.dt
         return {"speed": speed, "reached": 1.0 * (after <= self.goal_radius)} | _common(step)
 
 
 def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -> jax.Array:
-    """Targets `[B, 3]` at the height of a standing robot.
+    """Targets `[B, 3]` at the given distance and bearing, at the height of a standing robot.
 
     Args:
-      robot: gives the height.
-      state: of robots `[B]`, which the targets are seen from.
+      robot: the robot, for its standing height.
+      state: State `[B]`, from which distance and bearing are measured.
       distance: `[B]`, metres, horizontal.
       bearing: `[B]`, radians to the left of the heading.
     """
@@ -296,7 +296,7 @@ def ahead(robot: Robot, state: State, distance: jax.Array, bearing: jax.Array) -
 
 
 def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.Array]:
-    """Fresh starts of B lanes, turned by up to ± `start_yaw`, and what is left of their keys."""
+    """Initial states of B lanes, with a yaw in ± `start_yaw`, and new keys `[B]`."""
     streams = jax.vmap(lambda k: jax.random.split(k, 3))(keys)
     turn = jax.vmap(lambda k: jax.random.uniform(k, (), jnp.float32, -1.0, 1.0))(streams[:, 0])
     return robot.reset(streams[:, 1], start_yaw * turn), streams[:, 2]
@@ -305,7 +305,7 @@ def _fresh(robot: Robot, keys: jax.Array, start_yaw: float) -> tuple[State, jax.
 def to_transition(
     lanes: EnvState, action: jax.Array, after: State, outcome: Outcome, episode_steps: int
 ) -> Transition:
-    """The transition of lanes that have stepped, and whether their episodes end with it."""
+    """The transition from `lanes` to `after`; it is `last` if terminal, or at `episode_steps`."""
     return Transition(
         before=lanes.robots,
         action=action,
@@ -328,15 +328,15 @@ def _common(step: Transition) -> dict[str, jax.Array]:
 
 
 def inputs(s: jax.Array, relative_goal: Any) -> jax.Array:
-    """What a policy is fed: s `[..., S]`, or (s, g − o) `[..., S + 3]` where there are goals."""
+    """The input of a policy: s `[..., S]`, or (s, g − o) `[..., S + 3]` with a goal."""
     return s if relative_goal is None else jnp.concatenate([s, relative_goal], axis=-1)
 
 
 def input_size(robot: Robot, task: Task) -> int:
-    """Length of `inputs`."""
+    """Size of the input of a policy."""
     return robot.observation.size + 3 * task.goal_conditioned
 
 
 def bootstrapped_reward(step: Outcome | Transition, discounting: float) -> jax.Array:
-    """Reward `[...]` of a step and, if it is terminal, of all that would follow it."""
+    """Reward `[...]` of a step plus, if it is terminal, γ / (1 − γ) times the absorbing reward."""
     return step.reward + step.terminal * step.absorbing_reward * discounting / (1 - discounting)

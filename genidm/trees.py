@@ -1,4 +1,4 @@
-"""Trees of arrays: their leaves by name, and in what two trees differ."""
+"""Trees of arrays: names of their leaves, and differences between two trees."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from genidm.errors import BadInput
 
 
 def named(tree: Any) -> dict[str, Any]:
-    """Leaves by their paths, which do not tell a dict from a dataclass or a tuple.
+    """Path → leaf; dicts, dataclasses and tuples have the same paths.
 
     Raises:
-      BadInput: two leaves have one name.
+      BadInput: two leaves have the same path.
     """
     pairs = jax.tree_util.tree_flatten_with_path(tree)[0]
     leaves = {jax.tree_util.keystr(p, simple=True, separator="/") or "tree": x for p, x in pairs}
     if len(leaves) < len(pairs):
-        raise BadInput("two leaves of a tree have one name")
+        raise BadInput("two leaves of a tree have the same name")
     return leaves
 
 
@@ -31,13 +31,13 @@ def kinds(tree: Any) -> dict[str, str]:
 
 
 def _kind(x: Any) -> str:
-    """Dtype and shape; of one number only its kind, as jit makes arrays of Python's."""
+    """Dtype and shape; for a scalar no bit width, because jit converts Python numbers."""
     shape, dtype = np.shape(x), str(x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype)
     return f"{dtype}{list(shape)}" if shape else dtype.rstrip("0123456789")
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> tuple[str, str, str] | None:
-    """The first name whose `kinds` differ: (name, kind there, kind here); None if there is none."""
+    """First name whose `kinds` differ: (name, kind there, kind here); None if all are equal."""
     for name in sorted(there.keys() | here.keys()):
         both = there.get(name, "absent"), here.get(name, "absent")
         if both[0] != both[1]:
@@ -46,7 +46,7 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> tuple[str, 
 
 
 def not_finite(tree: Any) -> str | None:
-    """The name of the first leaf that holds NaN or infinity; None if there is none."""
+    """Name of the first leaf that holds NaN or infinity; None if all leaves are finite."""
     for name, x in named(tree).items():
         dtype = x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
         if jnp.issubdtype(dtype, jnp.inexact) and not np.isfinite(np.asarray(x)).all():

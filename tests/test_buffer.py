@@ -149,5 +149,5 @@ def test_a_buffer_is_made_of_whole_parts_and_no_fewer_than_two() -> None:
     for max_replay_size in (2 * UNROLL * LANES, 3 * UNROLL * LANES - 1):
         assert empty(part, max_replay_size).rows.s.shape == (2 * UNROLL, LANES, 2)
     for max_replay_size in (2 * UNROLL * LANES - 1, 0, -5):
-        with pytest.raises(BadInput, match="holds no two"):
+        with pytest.raises(BadInput, match="less than two"):
             empty(part, max_replay_size)

@@ -183,7 +183,7 @@ def test_corrupt_checkpoints_give_way_to_the_one_before(tmp_path: Path, capfd) -
 
 
 def test_two_leaves_of_one_name_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="one name"):
+    with pytest.raises(BadInput, match="same name"):
         Checkpoints(tmp_path).save(1, {"a": {"b": np.ones(1)}, "a/b": np.ones(1)})
 
 

@@ -309,11 +309,11 @@ def test_the_experience_of_another_robot_is_refused(copy: Path, capsys) -> None:
     tree, meta = load_arrays(chunk)
     wheels = {**tree, "physics": {"wheels": tree["s"]}}
     save_arrays(chunk, wheels, meta, overwrite=True)
-    refused(copy, capsys, "physics of another robot than point")
+    refused(copy, capsys, "physics of another robot, not point")
     save_arrays(chunk, {**tree, "s": tree["s"][..., 1:]}, meta, overwrite=True)
     refused(copy, capsys, "s has shape")
     save_arrays(chunk, {"x": tree["s"]}, meta, overwrite=True)
-    refused(copy, capsys, "holds no experience")
+    refused(copy, capsys, "does not hold an experience")
 
 
 def test_a_checkpoint_of_another_setting_is_refused(copy: Path, capsys) -> None:

@@ -71,5 +71,5 @@ def test_digest_sees_every_difference_and_nothing_else() -> None:
 
 
 def test_digest_refuses_what_it_cannot_tell_apart() -> None:
-    with pytest.raises(BadInput, match="cannot stand in a config"):
+    with pytest.raises(BadInput, match="cannot be part of a config"):
         config.digest({"robot": object()})

@@ -97,13 +97,19 @@ def interrupted(command: list[str], ready: bool, seconds: float) -> tuple[int, s
     made = subprocess.Popen(
         [sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=ROOT,
+        # Tests that run in the background inherit that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    assert made.stdout
-    if ready:
-        assert made.stdout.readline() == "began\n"
-    time.sleep(seconds)
-    made.send_signal(signal.SIGINT)
-    return made.returncode if made.poll() else made.wait(60), made.communicate()[1]
+    try:
+        assert made.stdout
+        if ready:
+            assert made.stdout.readline() == "began\n"
+        time.sleep(seconds)
+        made.send_signal(signal.SIGINT)
+        said = made.communicate(timeout=60)[1]
+        return made.returncode, said
+    finally:
+        made.kill()
 
 
 @pytest.mark.parametrize("seconds", [0.01, 0.06, 0.11])

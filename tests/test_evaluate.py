@@ -242,7 +242,7 @@ def numbers(tested_scenarios: Scenarios) -> list[np.ndarray]:
     ],
 )  # fmt: skip
 def test_a_controller_that_answers_something_else_is_refused(answer, given: str) -> None:
-    with pytest.raises(BadInput, match=rf"the controller must answer .* not {given}"):
+    with pytest.raises(BadInput, match=rf"the controller must return .* not {given}"):
         evaluate(Point(), answer, tested_scenarios(), EvaluationSettings(**FAST), quiet=True)
 
 

@@ -339,7 +339,7 @@ def save_and_load(record: Experience, path: Path) -> None:
         (dict(s=np.zeros((30, 4, 10))), "s has shape"),
         (dict(last=np.zeros((29, 5), bool)), "last has shape"),
         (dict(valid=np.zeros(30, bool)), "valid has shape"),
-        (dict(physics=np.zeros((29, 5, 3))), "physics is not of"),
+        (dict(physics=np.zeros((29, 5, 3))), "physics does not begin with"),
     ],
 )
 def test_a_record_with_nan_or_odd_shapes_is_refused(tmp_path: Path, wrong: dict, why: str) -> None:
@@ -348,7 +348,7 @@ def test_a_record_with_nan_or_odd_shapes_is_refused(tmp_path: Path, wrong: dict,
         pairs(ROBOT, bad)
     with pytest.raises(BadInput, match=why):
         replay(ROBOT, bad, KEY)
-    with pytest.raises(BadInput, match=f"{why}|not all arrays are of"):
+    with pytest.raises(BadInput, match=f"{why}|not all arrays begin with"):
         save_and_load(bad, tmp_path / "bad")
 
 

@@ -249,5 +249,5 @@ def test_no_goals_are_refused(number: int) -> None:
 
 @pytest.mark.parametrize("learner", [SAC, DDPG])
 def test_hindsight_without_goals_is_refused(learner: type) -> None:
-    with pytest.raises(BadInput, match="this task has none"):
+    with pytest.raises(BadInput, match="this task has no goals"):
         learner(her=HER()).learning(ROBOT, WalkForward(), devices.mesh())

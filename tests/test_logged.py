@@ -83,6 +83,30 @@ def test_a_goal_horizon_longer_than_all_episodes_is_said() -> None:
         generalize(Mine(), log(), jax.random.key(0), Generalize(mode="rotate"), goal_horizon=61)
 
 
+def test_a_record_is_checked_once_and_again_when_it_changes() -> None:
+    robot, prepared = Mine(), log().prepared(Mine())
+    assert prepared.prepared(robot) is prepared
+    half = prepared.first_fraction(0.5)
+    assert half.prepared(robot) is half
+    with pytest.raises(BadInput, match="a lies outside"):
+        prepared.replace(a=2 + prepared.a).prepared(robot)
+
+    class Other(Mine):
+        name = "other"
+        action = Layout((symmetry.joints("torque", [0], [1], "of full torque"),))
+
+    with pytest.raises(BadInput, match="a has shape"):
+        prepared.prepared(Other())
+
+
+def test_a_log_without_episodes_is_refused() -> None:
+    nothing = np.zeros_like(log().first)
+    with pytest.raises(BadInput, match="no step is marked as the first or the last"):
+        log().replace(first=nothing, last=nothing).prepared(Mine())
+    for flags in ({"first": nothing}, {"last": nothing}):
+        log().replace(**flags).prepared(Mine())
+
+
 def test_nothing_can_be_stepped() -> None:
     robot = Mine()
     for call in (robot.reset, robot.step, robot.set_state, robot.cost):
@@ -94,8 +118,8 @@ def test_nothing_can_be_stepped() -> None:
     ("changes", "why"),
     [
         (dict(a=3 * log().a), r"a lies outside \[−1, 1\]"),
-        (dict(last=log().last.astype(int)), "last is of int64, not bool"),
-        (dict(first=log().first[:, 0]), r"first has shape \(60,\), not that of \[steps, lanes\]"),
+        (dict(last=log().last.astype(int)), "last has dtype int64, expected bool"),
+        (dict(first=log().first[:, 0]), r"first has shape \(60,\), expected \[steps, lanes\]"),
         (dict(o=log().o[..., :2]), "o has shape"),
         (dict(s=-log().s), "'orientation' is not of length 1 with w ≥ 0"),
         (dict(s=2 * log().s), "'orientation' is not of length 1 with w ≥ 0"),
@@ -133,7 +157,7 @@ def headings(d: np.ndarray) -> list[float]:
 def test_flags_that_contradict_each_other_are_refused() -> None:
     for name, row in (("first", 30), ("last", 29)):
         wrong = dataclasses.replace(log(), **{name: with_(name, (row, 1), True)})
-        with pytest.raises(BadInput, match=r"step \[30, 1\] begins .* \(first, last\)"):
+        with pytest.raises(BadInput, match=r"step \[30, 1\] is (not first|first, but)"):
             ways(wrong)
 
 
@@ -241,7 +265,7 @@ def test_what_no_number_stands_for_is_refused(tmp_path: Path) -> None:
     masked = np.ma.masked_array(log().a, log().a > 0.9)
     words = log().a.astype(object)
     words[3, 1, 0] = "left"
-    for a, why in ((masked, "is masked"), (words, "something else than numbers")):
+    for a, why in ((masked, "is masked"), (words, "something other than numbers")):
         with pytest.raises(BadInput, match=why):
             ways(dataclasses.replace(log(), a=a))
     with pytest.raises(BadInput, match="a holds NaN"):
@@ -257,7 +281,7 @@ def test_a_controller_knows_the_layout_it_was_made_for(tmp_path: Path) -> None:
     other, fields = Mine(), Mine.observation.fields
     for observation in (Layout(fields[::-1]), Layout((*fields, symmetry.invariant("height")))):
         other.observation = observation
-        with pytest.raises(BadInput, match=r"another observation of the mine: orientation .* here"):
+        with pytest.raises(BadInput, match=r"another observation of the mine: it has orientation "):
             controller.load(tmp_path / "controller", other)
     more = Mine()
     more.action = Layout((symmetry.joints("torque", [1, 0, 2], [1, 1, 1], "of full torque"),))
@@ -290,13 +314,13 @@ def foreign(directory: Path, **changes: Any) -> None:
         (dict(idm=[8] * 999), "idm must be a list"), (dict(lfm=[8.5]), "lfm holds a width"),
         (dict(latent_size=10**18), "latent_size must be at most"),
         (dict(latent_size=-1), "latent_size must be at least"),
-        (dict(latent_size=3), "where its architecture has"),
+        (dict(latent_size=3), "but its architecture needs"),
         (dict(action_size=3), "action_size must be"), (dict(input_frame="body"), "frame must be"),
         (dict(input_frame=None), "frame must be"), (dict(robot=None), "a controller for None"),
         (dict(robot=["mine"]), "a controller for"),
         (dict(robot="a\x1b[2J\nb"), r"for 'a\\x1b\[2J\\n"),
-        (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\) there"),
-        (dict(observation=7), "no list of fields there"),
+        (dict(observation=[["a\n\x1b[31m", 1, 2, 3]]), r"'a\\n\\x1b\[31m' \(2 × 3, 1\); the robot"),
+        (dict(observation=7), "it has no list of fields"),
     ],
 )  # fmt: skip
 def test_what_a_controllers_directory_says_may_be_anything(
@@ -313,7 +337,7 @@ def test_what_a_controllers_directory_says_may_be_anything(
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda x: x.T, r"is float32\[\d+, \d+\], where its architecture has"),
+        (lambda x: x.T, r"is float32\[\d+, \d+\], but its architecture needs"),
         (lambda x: x * np.nan, "holds NaN or infinity"),
         (lambda x: x.astype(np.float64), "is float64"),
         (lambda x: x.astype("U3"), "is <U3"),
@@ -343,7 +367,9 @@ def test_a_controller_is_not_asked_with_what_is_not_finite() -> None:
 
 def test_episodes_given_by_their_first_steps_alone_are_refused() -> None:
     first = with_("first", ([0, 20, 40], slice(None)), True)
-    with pytest.raises(BadInput, match=r"step \[20, 0\] begins an episode, where none has ended"):
+    with pytest.raises(
+        BadInput, match=r"step \[20, 0\] is first, but the step before it is not last"
+    ):
         ways(dataclasses.replace(log(), first=first, last=np.zeros_like(first)))
 
 

@@ -602,7 +602,7 @@ def test_what_has_learned_nan_is_not_done(tmp_path: Path, name: str) -> None:
         return {}
 
     with pytest.raises(
-        BadInput, match=r"training/networks/\S+ holds NaN or infinity after 640 int"
+        BadInput, match=r"training_state/networks/\S+ holds NaN or infinity after 640 int"
     ):
         stage.run_once(work)
     assert not stage.done and not stage.checkpoints().steps()
@@ -628,9 +628,9 @@ def test_settings_that_cannot_be_are_refused(learner: type, wrong: dict, why: st
 
 
 def test_a_buffer_that_is_too_small_is_refused() -> None:
-    with pytest.raises(BadInput, match="never holds the 200 of min_replay_size"):
+    with pytest.raises(BadInput, match="never holds min_replay_size = 200"):
         SAC(**SMALL | {"max_replay_size": 2 * SIZE - 1})
     agent = SAC(**SMALL | {"max_replay_size": 2 * SIZE - 1, "min_replay_size": 0})
     learning = agent.learning(ROBOT, WalkForward(), devices.mesh())
-    with pytest.raises(BadInput, match="holds no two iterations"):
+    with pytest.raises(BadInput, match="is less than two iterations"):
         jax.eval_shape(learning.start, jax.random.key(0))

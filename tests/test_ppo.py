@@ -399,7 +399,9 @@ def test_a_learner_of_nan_is_refused_and_nothing_is_marked_done(tmp_path: Path) 
         return {}
 
     for _ in range(2):  # the same command again says the same
-        with pytest.raises(BadInput, match=r"training/params/\S+ holds NaN or infinity after 384 "):
+        with pytest.raises(
+            BadInput, match=r"training_state/params/\S+ holds NaN or infinity after 384 "
+        ):
             stage.run_once(work)
         assert not stage.done and not stage.checkpoints().steps()
         assert not stage.path("experience").exists()
@@ -438,7 +440,9 @@ def with_infinity(learner: Any) -> Any:
 def test_what_was_whole_before_is_kept_and_gone_on_from(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(collecting, "CHUNK", 2 * SIZE)
     stage = Stage.open(tmp_path, "collect", {})
-    with pytest.raises(BadInput, match=r"training/statistics/mean holds NaN or inf\w+ after 512"):
+    with pytest.raises(
+        BadInput, match=r"training_state/statistics/mean holds NaN or inf\w+ after 512"
+    ):
         gather(Breaking(PREPARED, 4, with_infinity), stage=stage)
     assert stage.checkpoints().steps() == [2]
     assert same(gather(stage=stage), undisturbed())

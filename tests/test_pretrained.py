@@ -92,7 +92,7 @@ def test_told_another_way_it_goes_there(change: Change) -> None:
 
 def test_there_is_none_for_others() -> None:
     assert "ant" in NAMES and set(NAMES) <= set(ROBOTS)
-    with pytest.raises(BadInput, match="no controller comes for 'cat'; there are some for: ant"):
+    with pytest.raises(BadInput, match="no pretrained controller for 'cat'; available: ant"):
         pretrained("cat")
 
 

@@ -92,7 +92,7 @@ def test_whether_it_minds_where_it_is_to_go_is_told(controller, minds: bool, cap
     capsys.readouterr()
     target = np.asarray(walks.target)
     found, said = heeds("HF", ways, target)["heeds"], capsys.readouterr().err
-    assert ("warning: HF hardly heeds where it is to go" in said) == (not minds), found
+    assert ("warning: HF hardly reacts to its goal" in said) == (not minds), found
     bearing = np.linspace(-np.pi / 4, np.pi / 4, FIG8_EPISODES)
     pairs = np.cos(bearing[:, None] - bearing).sum() - FIG8_EPISODES
     if minds:  # each way is that to its own target

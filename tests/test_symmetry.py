@@ -200,7 +200,7 @@ def test_joints_go_to_the_joint_across() -> None:
 def test_what_is_across_is_across_from_it(order: list[int]) -> None:
     for make in (lambda: symmetry.joints("legs", order, [1] * len(order), "rad"),
                  lambda: symmetry.wrenches("feet", order)):  # fmt: skip
-        with pytest.raises(BadInput, match="one mirror image"):
+        with pytest.raises(BadInput, match="its own inverse"):
             make()
 
 
@@ -259,13 +259,13 @@ def test_a_layout_describes_itself(layout: Layout) -> None:
 
 
 def test_a_layout_refuses_names_given_twice() -> None:
-    with pytest.raises(ValueError, match="names a field twice"):
+    with pytest.raises(ValueError, match="the same name"):
         Layout((symmetry.vector("v"), symmetry.invariant("v")))
 
 
 def test_a_layout_refuses_other_sizes(layout: Layout) -> None:
     for use in (layout.mirror, layout.yaw, lambda x: layout.rotate(x, 0.0)):
-        with pytest.raises(ValueError, match="expected 33 numbers, not 32"):
+        with pytest.raises(ValueError, match="expected 33 numbers, got 32"):
             use(jnp.zeros((LANES, 32)))
 
 

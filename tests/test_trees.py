@@ -16,7 +16,7 @@ TREE = {"a": (np.zeros((2, 3), np.int8), 1.5), "key": jax.random.key(0), "b": {"
 def test_leaves_are_named_by_their_paths() -> None:
     assert list(trees.named(TREE)) == ["a/0", "a/1", "b/c", "key"]
     assert trees.named(3) == {"tree": 3}
-    with pytest.raises(BadInput, match="one name"):
+    with pytest.raises(BadInput, match="same name"):
         trees.named({"a": {"b": 1}, "a/b": 2})
 
 

@@ -138,7 +138,7 @@ def test_any_planner_will_do() -> None:
     ],
 )
 def test_a_planner_that_answers_something_else_is_refused(planner, answer: str) -> None:
-    said = rf"the planner must answer .* of shape \(\d, 3\), a row a robot, not {answer}"
+    said = rf"the planner must return .* of shape \(\d, 3\), one row per robot, not {answer}"
     with pytest.raises(BadInput, match=said):
         journey(Point(), planner=planner)
 
@@ -153,7 +153,7 @@ def test_a_planner_that_answers_something_else_is_refused(planner, answer: str) 
     ],
 )
 def test_a_planner_that_looks_at_numbers_on_the_host_is_told_how_to(planner) -> None:
-    with pytest.raises(BadInput, match="the planner is asked inside a compiled program"):
+    with pytest.raises(BadInput, match="the planner is called inside a compiled program"):
         journey(Point(), planner=planner)
 
 
@@ -173,7 +173,7 @@ def test_a_planner_may_answer_with_numpys_constant() -> None:
 )
 def test_a_controller_that_answers_something_else_is_refused(controller) -> None:
     keys = jax.random.split(jax.random.key(0), 2)
-    with pytest.raises(BadInput, match=r"the controller must answer .* of shape \(1, 3\)"):
+    with pytest.raises(BadInput, match=r"the controller must return .* of shape \(1, 3\)"):
         follow_waypoints(Point(), controller, WAYPOINTS, keys, np.zeros(2), quiet=True)
 
 
@@ -183,7 +183,7 @@ def test_waypoints_may_have_a_height_and_must_be_finite() -> None:
     for wrong in (np.zeros((0, 2)), np.zeros(3), [[1.0, np.nan]], np.zeros((2, 4))):
         with pytest.raises(BadInput, match="waypoints"):
             journey(Point(), waypoints=wrong)
-    with pytest.raises(BadInput, match="each of as many"):
+    with pytest.raises(BadInput, match="all of the same length"):
         journey(Point(), waypoints=[[1.0, 2.0], [3.0]])
     with pytest.raises(BadInput, match=r"goal_radius must lie in \(0, ∞\)"):
         WaypointSettings(goal_radius=0.0)
@@ -194,7 +194,7 @@ def test_a_robot_has_a_key_and_a_yaw() -> None:
     for yaw in (np.zeros(3), 0.0):
         with pytest.raises(BadInput, match=r"keys \[B\] and yaw \[B\]"):
             follow_waypoints(Point(), lambda s, way: way, WAYPOINTS, keys, yaw)
-    with pytest.raises(BadInput, match="no robots to lead"):
+    with pytest.raises(BadInput, match="there are no robots"):
         follow_waypoints(Point(), lambda s, way: way, WAYPOINTS, keys[:0], np.zeros(0))
 
 

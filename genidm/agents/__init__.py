@@ -1,3 +1,3 @@
-"""Agents that collect experience, composed from the parts of `brax.training`."""
+"""Agents that collect experience, built from parts of `brax.training`."""
 
-import genidm.quiet  # noqa: F401  before Brax imports MJX
+import genidm.quiet  # noqa: F401  must come before Brax imports MJX

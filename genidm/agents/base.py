@@ -1,4 +1,4 @@
-"""What `collect` asks of an agent."""
+"""The interface between `collect` and an agent."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Iterate = Callable[[Any], tuple[Any, Experience, Metrics]]
 
 
 class Learning(NamedTuple):
-    """An agent at work on a robot.
+    """The functions that train an agent on a robot.
 
     Attributes:
-      start: key → learner: a tree of arrays that holds all there is to resume from.
-      place: learner → the same learner on its devices, from wherever it was.
+      start: key → learner: a tree of arrays with everything that a resume needs.
+      place: learner → the same learner, moved to the devices of the mesh.
       prepare: learner → `iterate`: compiles the agent's programs for a placed learner.
-        `iterate` takes a learner, which it donates, to (learner, Experience
-        `[unroll_length, lanes, ...]` on the devices, metrics).
+        `iterate` maps a learner, which it donates, to (learner, Experience
+        `[unroll_length, num_envs, ...]` on the devices, metrics).
     """
 
     start: Callable[[jax.Array], Any]
@@ -35,11 +35,11 @@ class Learning(NamedTuple):
 
 
 class Agent(abc.ABC):
-    """Settings of an agent; subclasses are frozen dataclasses, so that their fields are flags.
+    """Settings of an agent; subclasses are frozen dataclasses, whose fields become flags.
 
     Attributes:
-      num_envs: robots at once.
-      unroll_length: steps an iteration.
+      num_envs: number of lanes: environments that step together.
+      unroll_length: environment steps per lane in one iteration.
     """
 
     @property
@@ -51,12 +51,12 @@ class Agent(abc.ABC):
 
     @abc.abstractmethod
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
-        """The agent on this robot, its lanes sharded over the mesh."""
+        """Functions that train the agent on this robot, with its lanes sharded over the mesh."""
 
     @abc.abstractmethod
     def policy(self, robot: Robot, task: Task, learner: Any) -> Policy | None:
-        """The policy of a learner, without exploration; None if it learns nothing."""
+        """The learned policy, without exploration; None for an agent that does not learn."""
 
     def for_accelerator(self) -> Self:
-        """The settings where jax runs on an accelerator: these, unless a subclass has others."""
+        """Settings for an accelerator: the same settings, unless a subclass overrides this."""
         return self

@@ -1,7 +1,7 @@
-"""A replay buffer that knows episodes: a ring of steps on one device, lane by lane.
+"""A replay buffer that preserves episodes: a ring of environment steps on one device.
 
-Rows are steps of all lanes, in the order they happened, so what follows a step in its
-episode lies below it in the same column.
+A row holds one step of every lane. Rows are in time order, so the next step of an episode
+is in the next row of the same column.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from genidm.tasks import Transition
 
 
 class ReplayTransition(flax.struct.PyTreeNode):
-    """What is remembered of steps `[...]`; the state after one is s of the next row.
+    """Stored steps `[...]`; the state after a step is s of the next row.
 
     Attributes:
-      s: `[..., S]`, before the step.
-      o: `[..., 3]`, position before it, metres, world frame.
-      o_next: `[..., 3]`, position after it, before any reset.
-      a: `[..., A]`.
-      goal: `[..., 3]`, metres, world frame; None where the task has none.
+      s: `[..., S]`, state before the step.
+      o: `[..., 3]`, position before the step, metres, world frame.
+      o_next: `[..., 3]`, position after the step, before any reset.
+      a: `[..., A]`, action.
+      goal: `[..., 3]`, metres, world frame; None if the task has no goals.
       cost: control and contact costs.
       fallen: bool, the robot fell, or its physics diverged.
       reward: see `Transition`.
@@ -51,7 +51,7 @@ class ReplayTransition(flax.struct.PyTreeNode):
 
 
 def to_replay_transition(robot: Robot, step: Transition) -> ReplayTransition:
-    """The memory of one transition of B lanes, `[B, ...]`."""
+    """Convert one transition of B lanes to what the buffer stores, `[B, ...]`."""
     return ReplayTransition(
         s=step.before.observation,
         o=step.before.position,
@@ -72,8 +72,8 @@ class Buffer(flax.struct.PyTreeNode):
     """The newest T steps of B lanes.
 
     Attributes:
-      rows: ReplayTransition `[T, B, ...]`, a ring: row n of all that were written lies at n mod T.
-      written: int32, rows since the start.
+      rows: ReplayTransition `[T, B, ...]`, a ring: the n-th written row is at index n mod T.
+      written: int32, number of rows written since the start.
     """
 
     rows: ReplayTransition
@@ -81,43 +81,45 @@ class Buffer(flax.struct.PyTreeNode):
 
     @property
     def filled(self) -> jax.Array:
-        """Rows that hold something."""
+        """Number of rows that hold steps."""
         return jnp.minimum(self.written, self.rows.last.shape[0])
 
     @property
     def oldest(self) -> jax.Array:
-        """Where the oldest row lies."""
+        """Index of the oldest row."""
         return (self.written - self.filled) % self.rows.last.shape[0]
 
 
 class Index(NamedTuple):
-    """Steps in a buffer: `row [N]` and `lane [N]`, int32."""
+    """Indices of N steps in a buffer: `row [N]` and `lane [N]`, int32."""
 
     row: jax.Array
     lane: jax.Array
 
 
 def empty(part: ReplayTransition, max_replay_size: int) -> Buffer:
-    """A buffer for parts like this one.
+    """An empty buffer.
 
     Args:
-      part: ReplayTransition `[U, B, ...]`, or its shapes.
-      max_replay_size: steps, over all lanes; rounded down to whole parts.
+      part: ReplayTransition `[U, B, ...]` of one iteration, or its shapes.
+      max_replay_size: steps, over all lanes; rounded down to whole iterations.
 
     Raises:
-      BadInput: not even two parts fit.
+      BadInput: the buffer is smaller than two iterations.
     """
     unroll_length, lanes = part.last.shape
     rows = max_replay_size // (unroll_length * lanes) * unroll_length
     if rows < 2 * unroll_length:
         size = unroll_length * lanes
-        raise BadInput(f"a buffer for {max_replay_size} steps holds no two iterations of {size}")
+        raise BadInput(
+            f"max_replay_size {max_replay_size} is less than two iterations of {size} steps"
+        )
     blank = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), part)
     return Buffer(blank, jnp.zeros((), jnp.int32))
 
 
 def add(buffer: Buffer, part: ReplayTransition) -> Buffer:
-    """The buffer with a part `[U, B, ...]` in the place of its oldest rows; U divides T."""
+    """Overwrite the oldest rows with a part `[U, B, ...]`; U must divide T."""
     row = buffer.written % buffer.rows.last.shape[0]
 
     def write(ring: jax.Array, new: jax.Array) -> jax.Array:
@@ -129,13 +131,13 @@ def add(buffer: Buffer, part: ReplayTransition) -> Buffer:
 
 @functools.partial(jax.jit, static_argnums=1)
 def newest(buffer: Buffer, count: int) -> ReplayTransition:
-    """The newest rows `[count, B, ...]`, in the order that they were written in."""
+    """The newest rows `[count, B, ...]`, oldest first."""
     row = (buffer.written - count + jnp.arange(count)) % buffer.rows.last.shape[0]
     return jax.tree.map(lambda x: x[row], buffer.rows)
 
 
 def steps_left(buffer: Buffer) -> jax.Array:
-    """Steps `[T, B]` int32 that follow each one in its episode, as far as it is remembered."""
+    """Number of stored steps `[T, B]` int32 that follow each step in its episode."""
     rows = buffer.rows.last.shape[0]
     last = jnp.roll(buffer.rows.last, -buffer.oldest, axis=0)
     time = jnp.arange(rows, dtype=jnp.int32)[:, None]
@@ -145,7 +147,7 @@ def steps_left(buffer: Buffer) -> jax.Array:
 
 
 def sample_index(buffer: Buffer, key: jax.Array, size: int) -> Index:
-    """Steps drawn evenly from all but the newest row, which nothing follows yet."""
+    """Sample steps uniformly; exclude the newest row, because its next state is not stored yet."""
     rows, lanes = buffer.rows.last.shape
     which, where = jax.random.split(key)
     row = jax.random.randint(which, (size,), 0, buffer.filled - 1)
@@ -153,9 +155,9 @@ def sample_index(buffer: Buffer, key: jax.Array, size: int) -> Index:
 
 
 def gather(buffer: Buffer, at: Index) -> tuple[ReplayTransition, jax.Array]:
-    """The steps `[N, ...]` at an index, and the states `[N, S]` in the rows after them.
+    """Steps `[N, ...]` at the given indices, and their next states `[N, S]`.
 
-    Where a step is the last of its episode, the row after it is the start of another.
+    After the last step of an episode, the next state is the first of the next episode.
     """
     rows = buffer.rows.last.shape[0]
     return (

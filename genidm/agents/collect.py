@@ -1,4 +1,4 @@
-"""Collecting (§4.1): an agent learns one task, and all it sees is kept."""
+"""Collection (§4.1): an agent learns one task, and all its experience is recorded."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from genidm.robots.base import Robot
 from genidm.store import Stage
 from genidm.tasks import EnvState, Task, WalkForward
 
-# Transitions that are written to disk at a time.
+# Transitions per chunk on disk.
 CHUNK = 1 << 17
-# Transitions of an iteration: so many of the Ant's take 2 GB before anything is learned from them.
+# Maximum transitions per iteration: for the Ant these take 2 GB before any learning.
 MOST_AT_ONCE = 1 << 22
 
 
@@ -38,28 +38,28 @@ def collect(
     keep: bool = True,
     quiet: bool = False,
 ) -> tuple[Any, Any]:
-    """Lets an agent learn for a number of interactions, and keeps every one of them.
+    """Train an agent for a number of interactions, and record all of them.
 
-    Recording costs no interaction: what the agent learned from is what is kept, in order.
+    The training steps themselves are recorded, so a record needs no extra interactions.
 
     Args:
-      robot: what walks.
-      agent: what moves it, and learns.
-      interactions: steps of one robot, counted over all lanes; rounded up to a whole
-        iteration of the agent.
-      seed: of everything random in here.
-      task: what is rewarded; walking forward, unless given.
-      mesh: devices to share the lanes among, evenly; of those that the robot's engine wants as
-        many as can, unless given.
-      stage: where the record, checkpoints and metrics go; they stay in memory, unless given.
-      keep: keep the record; off, the learner is all that is left.
-      quiet: no progress bar.
+      robot: the robot.
+      agent: the settings of the agent.
+      interactions: environment steps over all lanes; rounded up to whole iterations.
+      seed: random seed.
+      task: reward and end of an episode; default: `WalkForward()`.
+      mesh: devices that share the lanes; their number must divide `num_envs`. Default: as many
+        devices of the robot's engine as possible.
+      stage: directory for the record, checkpoints and metrics; default: memory only.
+      keep: whether to keep the record; if False, only the learner is kept.
+      quiet: show no progress bar.
 
     Returns:
-      the Experience `[T, lanes, ...]` (None unless kept), and the learner as it ended.
+      the Experience `[T, num_envs, ...]` (None if `keep` is False), and the final learner.
 
     Raises:
-      BadInput: what the learner has learned is not finite; nothing of that is kept.
+      BadInput: a setting is out of range, or a learned parameter is not finite; the
+        parameters are then not saved.
     """
     mesh = mesh or devices.dividing(robot.mesh(), agent.num_envs)
     _check(agent, interactions, seed, mesh)
@@ -85,7 +85,7 @@ def collect(
 
 
 def whole(agent: Agent, interactions: int) -> int:
-    """Interactions, rounded up to a whole iteration of the agent: what `collect` makes."""
+    """Number of interactions that `collect` makes: rounded up to whole iterations."""
     size = agent.num_envs * agent.unroll_length
     return -(-interactions // size) * size
 
@@ -94,31 +94,33 @@ def _check(agent: Agent, interactions: int, seed: int, mesh: Mesh) -> None:
     check_value("interactions", interactions, count())
     check_value("seed", seed, checks.seed())
     check_value(
-        "lanes × unroll_length", agent.num_envs * agent.unroll_length, count(1, MOST_AT_ONCE)
+        "num_envs × unroll_length", agent.num_envs * agent.unroll_length, count(1, MOST_AT_ONCE)
     )
     if agent.num_envs % mesh.size:
         raise BadInput(f"{agent.num_envs} lanes cannot be shared among {mesh.size} devices evenly")
 
 
 def _check_learned(learner: Any, interactions: int) -> None:
-    """Refuses parameters, or what else is learned, that are not finite."""
-    still = EnvState | Buffer  # robots, and what they did: NaN never gets there
+    """Raise BadInput if a parameter, or another learned array, is not finite."""
+    # Robot states and buffers stay finite: a step that diverges repeats the state before it.
+    not_learned = EnvState | Buffer
     learned = jax.tree.map(
-        lambda x: None if isinstance(x, still) else x,
+        lambda x: None if isinstance(x, not_learned) else x,
         learner,
-        is_leaf=lambda x: isinstance(x, still),
+        is_leaf=lambda x: isinstance(x, not_learned),
     )
     if name := trees.not_finite(learned):
         raise BadInput(
-            f"{name} holds NaN or infinity after {interactions} interactions: what was learned is "
-            "of no use. A smaller learning rate may help"
+            f"{name} holds NaN or infinity after {interactions} interactions: the policy cannot "
+            "be used. A smaller learning rate may help"
         )
 
 
 class _Log:
-    """The record so far: on the devices until a chunk is full, then on disk if there is a stage.
+    """The record and the checkpoints of a collection.
 
-    Unless it is to be kept, only the checkpoints are.
+    The newest parts stay on the devices until a chunk is full. Then the chunk moves to the
+    host and, with a stage, to disk. Without `keep` there is no record, only checkpoints.
     """
 
     def __init__(self, robot: Robot, stage: Stage | None, chunk: int, keep: bool):
@@ -138,7 +140,7 @@ class _Log:
             self.parts.append(part)
 
     def flush(self, iteration: int, learner: Any) -> None:
-        """Brings the parts to the host; with a stage, also to disk, and then a checkpoint."""
+        """Move the parts to the host; with a stage, also write them and a checkpoint to disk."""
         self.waiting = 0
         if self.keep:
             self.chunks.append(concatenate(self.parts))
@@ -150,7 +152,7 @@ class _Log:
             self.checkpoints.save(iteration, {"learner": learner, "chunks": len(self.chunks)})
 
     def resume(self, learner: Any, learning: Learning) -> tuple[int, Any]:
-        """Iterations done, and the learner after them."""
+        """Number of completed iterations, and the learner after them."""
         like = {"learner": learner, "chunks": 0}
         found = self.checkpoints and self.checkpoints.latest(like)
         if not self.stage or not found:

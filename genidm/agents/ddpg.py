@@ -1,4 +1,4 @@
-"""DDPG (Lillicrap et al. 2016), on Brax's networks."""
+"""DDPG (Lillicrap et al. 2016), with Brax's networks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from genidm.robots.base import Robot
 
 
 class DDPGState(flax.struct.PyTreeNode):
-    """Parameters of policy and critic, their targets, and the optimizers."""
+    """Parameters of the policy, the critic and their targets, and optimizer states."""
 
     policy: Any
     critic: Any
@@ -37,10 +37,10 @@ class DDPG(OffPolicy):
     """Settings of DDPG.
 
     Attributes:
-      noise: standard deviation of what is added to actions while exploring.
-      random: share of exploring actions that are drawn evenly instead.
-      action_cost: weight of the mean square of the actions before tanh in the policy's
-        loss, which keeps them out of tanh's flat ends.
+      noise: standard deviation of the Gaussian exploration noise.
+      random: fraction of the actions that are uniform random instead.
+      action_cost: weight, in the policy loss, of the mean square of the actions before tanh;
+        it keeps tanh from saturating.
     """
 
     noise: float = 0.1
@@ -52,7 +52,7 @@ class DDPG(OffPolicy):
         check(self, noise=number(0), random=number(0, 1), action_cost=number(0))
 
     def networks(self, robot: Robot, size: int) -> tuple[FeedForwardNetwork, FeedForwardNetwork]:
-        """Brax's policy (before tanh) and critic, on normalised inputs."""
+        """Brax's policy network (before tanh) and critic, with normalised inputs."""
         actions = robot.action.size
         return (
             make_policy_network(actions, size, normalize, self.policy_hidden_layer_sizes),
@@ -67,15 +67,15 @@ class DDPG(OffPolicy):
         statistics: RunningStatisticsState,
         batch: BraxTransition,
     ) -> jax.Array:
-        """Half the mean square of Q(x, a) − (r + γ Q'(x', μ'(x'))); truncated steps count 0."""
+        """Half the mean square of Q(x, a) − (r + γ Q'(x', μ'(x'))); truncated steps add 0."""
         mu, q = networks
         action = jnp.tanh(mu.apply(statistics, targets[0], batch.next_observation))
-        following = q.apply(statistics, targets[1], batch.next_observation, action)[..., 0]
+        next_value = q.apply(statistics, targets[1], batch.next_observation, action)[..., 0]
         reward = self.reward_scaling * batch.reward
-        target = reward + self.discounting * batch.discount * following
-        here = q.apply(statistics, critic, batch.observation, batch.action)[..., 0]
-        kept = 1 - batch.extras["state_extras"]["truncation"]
-        return 0.5 * jnp.mean((kept * (here - target)) ** 2)
+        target = reward + self.discounting * batch.discount * next_value
+        value = q.apply(statistics, critic, batch.observation, batch.action)[..., 0]
+        mask = 1 - batch.extras["state_extras"]["truncation"]
+        return 0.5 * jnp.mean((mask * (value - target)) ** 2)
 
     def loss_policy(
         self,
@@ -85,7 +85,7 @@ class DDPG(OffPolicy):
         statistics: RunningStatisticsState,
         batch: BraxTransition,
     ) -> jax.Array:
-        """−Q(x, μ(x)), batch mean, and the actions' cost."""
+        """Batch mean of −Q(x, μ(x)), plus the action cost."""
         mu, q = networks
         raw = mu.apply(statistics, policy, batch.observation)
         value = q.apply(statistics, critic, batch.observation, jnp.tanh(raw))
@@ -107,15 +107,15 @@ class DDPG(OffPolicy):
         def start(key: jax.Array) -> DDPGState:
             keys = jax.random.split(key)
             params = [net.init(k) for net, k in zip(networks, keys, strict=True)]
-            # Targets are copies: one buffer cannot be donated twice.
+            # The targets must be copies, because jax cannot donate one array twice.
             targets = jax.tree.map(jnp.copy, params)
             return DDPGState(*params, *targets, *(adam.init(p) for p in params))
 
         def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            which, noise, anywhere = jax.random.split(key, 3)
+            which, noise, uniform = jax.random.split(key, 3)
             size = (robot.action.size,)
             explores = jax.random.uniform(which, (), jnp.float32) < self.random
-            drawn = jax.random.uniform(anywhere, size, jnp.float32, minval=-1.0)
+            drawn = jax.random.uniform(uniform, size, jnp.float32, minval=-1.0)
             return explores, self.noise * jax.random.normal(noise, size, jnp.float32), drawn
 
         def act(

@@ -1,4 +1,4 @@
-"""An agent that has learned, and learns no more: how the Humanoid collects (A.1.2)."""
+"""An agent whose policy is fixed after training: how the Humanoid collects (A.1.2)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from genidm.tasks import EnvState, Task, input_size
 
 @dataclasses.dataclass(frozen=True)
 class Frozen:
-    """Settings: the agent learns for a share of the interactions, of which nothing is kept.
+    """Settings to train an agent first, and then record experience with its fixed policy.
 
-    The others are its record, made by the policy that it ended with, which still explores as
-    it did while it learned.
+    The training steps are not recorded. The final policy collects the record, with the same
+    exploration as in training.
 
     Attributes:
-      agent: what learns.
-      fraction: of the interactions that it learns from.
+      agent: settings of the agent that is trained.
+      fraction: fraction of the interactions that are for training, in (0, 1).
     """
 
     agent: LearningAgent
@@ -38,17 +38,17 @@ class Frozen:
         check(self, fraction=number(0, 1, above=True, below=True))
 
     def for_accelerator(self) -> Frozen:
-        """The same with its agent's settings for an accelerator."""
+        """These settings, with the agent's settings for an accelerator."""
         return dataclasses.replace(self, agent=self.agent.for_accelerator())
 
 
 @dataclasses.dataclass(frozen=True)
 class Acting(Agent):
-    """The agent that a frozen one is once it has learned.
+    """An agent that collects with a fixed policy and does not learn.
 
     Attributes:
-      agent: as which it explores.
-      learned: what it ended with.
+      agent: settings of the trained agent; they define the exploration.
+      learned: the policy after training.
     """
 
     agent: LearningAgent
@@ -63,11 +63,11 @@ class Acting(Agent):
         return self.agent.unroll_length
 
     def policy(self, robot: Robot, task: Task, learner: Any) -> Policy:
-        """The policy that it was given."""
+        """The fixed policy."""
         return self.learned
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
-        """The first of the agent's two programs, again and again."""
+        """Functions that repeat the rollout program of `agent`, with the fixed policy."""
         stepping = self.agent.programs(robot, task, mesh).stepping
         statistics = no_statistics(input_size(robot, task))
         statistics = statistics.replace(mean=self.learned.mean, std=self.learned.std)
@@ -77,7 +77,7 @@ class Acting(Agent):
             return task.start(robot, jax.random.split(key, self.num_envs))
 
         def prepare(lanes: EnvState) -> Iterate:
-            program = compile_ahead("a frozen agent's stepping", stepping, *actor_params, lanes)
+            program = compile_ahead("rollout of the fixed policy", stepping, *actor_params, lanes)
 
             def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
                 lanes, experience, _, seen = program(*actor_params, lanes)

@@ -1,4 +1,4 @@
-"""Hindsight experience replay (Andrychowicz et al. 2017): where a robot got to was a goal."""
+"""Hindsight experience replay (Andrychowicz et al. 2017): reached positions become goals."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Strategy = Literal["future", "final", "episode"]
 
 @dataclasses.dataclass(frozen=True)
 class HER:
-    """Settings of the relabelling.
+    """Settings of hindsight experience replay: how sampled steps get new goals.
 
     Attributes:
-      goal_selection_strategy: goals are positions after this step in its episode ("future"), the
-        last one of the episode ("final"), or any of it ("episode"). Of an episode that is not over,
-        what has happened so far counts.
-      n_sampled_goal: of each step drawn with its own goal, this many are drawn with another.
+      goal_selection_strategy: the new goal is a position that the episode reaches after this step
+        ("future"), its last position ("final"), or any of its positions ("episode"). For an
+        unfinished episode, the stored steps count.
+      n_sampled_goal: number of relabelled steps per step with its original goal, on average.
     """
 
     goal_selection_strategy: Strategy = "future"
@@ -34,14 +34,16 @@ class HER:
     def goal(
         self, buffer: Buffer, left: jax.Array, at: Index, key: jax.Array, height: float
     ) -> jax.Array:
-        """Goals `[N, 3]` for the steps at an index, `n_sampled_goal` of n + 1 relabelled.
+        """Goals `[N, 3]` of sampled steps, relabelled with probability n / (n + 1).
+
+        n is `n_sampled_goal`.
 
         Args:
-          buffer: what happened.
-          left: `steps_left` of it.
-          at: the steps.
-          key: of which are relabelled, and to what.
-          height: metres; goals are given it, as all goals of the task have it.
+          buffer: the stored steps.
+          left: `steps_left(buffer)`.
+          at: the sampled steps.
+          key: random key.
+          height: metres, the height of all goals of the task.
         """
         which, when = jax.random.split(key)
         relabelled = jax.random.uniform(which, at.row.shape, jnp.float32) < self.n_sampled_goal / (
@@ -54,11 +56,11 @@ class HER:
         return jnp.where(relabelled[:, None], reached, buffer.rows.goal[at.row, at.lane])
 
     def _window(self, buffer: Buffer, left: jax.Array, at: Index) -> tuple[jax.Array, jax.Array]:
-        """First and last step `[N]` whose outcome may be the goal, counted from this step."""
+        """Offsets `[N]` from a step to the first and last step whose o_next may be its goal."""
         left = left[at.row, at.lane]
         if self.goal_selection_strategy == "future":
             return jnp.zeros_like(left), left
         if self.goal_selection_strategy == "final":
             return left, left
-        kept = (at.row - buffer.oldest) % buffer.rows.last.shape[0]  # rows before it
-        return -jnp.minimum(buffer.rows.episode_step[at.row, at.lane], kept), left
+        older = (at.row - buffer.oldest) % buffer.rows.last.shape[0]  # rows before this step
+        return -jnp.minimum(buffer.rows.episode_step[at.row, at.lane], older), left

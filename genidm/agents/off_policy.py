@@ -1,8 +1,8 @@
-"""The loop that SAC and DDPG share: step, remember, learn from a replay buffer.
+"""The loop that SAC and DDPG share: step, store, learn from a replay buffer.
 
-An iteration is two programs, as PPO's: in the first every device steps its own lanes; in
-the second the buffer takes the steps in and `grad_updates_per_step` minibatches are learned from,
-on one device. What differs between learners is an `Algorithm`.
+Like PPO's, an iteration has two programs. In the first, every device steps its own lanes.
+In the second, one device adds the steps to the buffer and makes `grad_updates_per_step`
+updates, each from one minibatch. An `Algorithm` holds what differs between SAC and DDPG.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from genidm.tasks import (
 
 
 class Algorithm(NamedTuple):
-    """What a learner is made of.
+    """The functions that define an off-policy algorithm.
 
     Attributes:
-      start: key → networks and their optimizers, a tree whose `policy` acts.
-      draw: key → the random numbers that an action of one robot takes.
+      start: key → tree of networks and optimizer states; its `policy` chooses actions.
+      draw: key → the random numbers for one action of one robot.
       act: (statistics, policy, inputs `[B, I]`, random numbers `[B, ...]`) → actions `[B, A]`,
         with exploration.
       update: (tree, statistics, BraxTransition `[N, ...]`, key) → (tree, losses).
@@ -71,7 +71,7 @@ class Algorithm(NamedTuple):
 
 
 class TrainingState(flax.struct.PyTreeNode):
-    """What learns: networks with their optimizers, statistics of the inputs, the buffer, a key."""
+    """Networks and optimizer states, statistics of the inputs, the buffer and a random key."""
 
     networks: Any
     statistics: RunningStatisticsState
@@ -80,29 +80,29 @@ class TrainingState(flax.struct.PyTreeNode):
 
     @property
     def actor_params(self) -> tuple[RunningStatisticsState, Any]:
-        """What chooses actions."""
+        """Statistics and policy parameters: all that a rollout needs."""
         return self.statistics, self.networks.policy
 
 
 @dataclasses.dataclass(frozen=True)
 class OffPolicy(LearningAgent):
-    """Settings that off-policy learners share.
+    """Settings that off-policy agents share.
 
     Attributes:
-      num_envs: robots at once.
-      unroll_length: steps an iteration.
-      grad_updates_per_step: gradient updates an iteration, which is Brax's training step:
-        unroll_length steps of every environment.
-      batch_size: steps a minibatch.
-      max_replay_size: steps that the buffer holds.
-      min_replay_size: steps before the first update.
-      learning_rate: of Adam.
-      discounting: of rewards, a step.
-      tau: share of the networks in their targets, an update.
-      reward_scaling: rewards are multiplied by it.
-      policy_hidden_layer_sizes: layers of the policy (Table 2: 64×64).
-      critic_hidden_layer_sizes: layers of the critics.
-      her: relabelling; None learns from the task's own goals and rewards.
+      num_envs: number of lanes: environments that step together.
+      unroll_length: environment steps per lane in one iteration.
+      grad_updates_per_step: gradient updates per iteration (Brax calls an iteration a training
+        step): per unroll_length steps of all lanes.
+      batch_size: steps per minibatch.
+      max_replay_size: maximum number of steps in the buffer.
+      min_replay_size: number of steps in the buffer before the first update.
+      learning_rate: learning rate of Adam.
+      discounting: discount factor γ per step.
+      tau: weight of the new networks in the target networks, per update.
+      reward_scaling: factor for rewards.
+      policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
+      critic_hidden_layer_sizes: widths of the critics' hidden layers.
+      her: settings of relabelling; None keeps the original goals and rewards.
     """
 
     activation: ClassVar[Activation] = "relu"
@@ -139,13 +139,13 @@ class OffPolicy(LearningAgent):
         )
         size = self.num_envs * self.unroll_length
         if self.min_replay_size > self.max_replay_size // size * size:
-            room = f"a buffer for {self.max_replay_size} steps"
-            raise BadInput(f"{room} never holds the {self.min_replay_size} of min_replay_size")
+            buffer = f"a buffer of max_replay_size {self.max_replay_size}"
+            raise BadInput(f"{buffer} never holds min_replay_size = {self.min_replay_size} steps")
 
     def for_accelerator(self) -> Self:
-        """The same with one step of many robots an iteration, which an accelerator makes at once.
+        """Settings for an accelerator: more lanes, and one step per iteration.
 
-        As many steps lie between updates as before, and the policy that makes them is newer.
+        An iteration has as many steps as before, but the policy changes after every step.
         """
         return dataclasses.replace(
             self, num_envs=self.num_envs * self.unroll_length, unroll_length=1
@@ -153,16 +153,17 @@ class OffPolicy(LearningAgent):
 
     @abc.abstractmethod
     def algorithm(self, robot: Robot, size: int) -> Algorithm:
-        """The learner's networks and losses, for inputs of this size."""
+        """The algorithm's networks and losses for policy inputs `[size]`."""
 
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
-        """The two programs of an iteration.
+        """The rollout and learning programs of an iteration.
 
         Raises:
-          BadInput: there is HER, and the task has no goals.
+          BadInput: `her` is set, but the task has no goals. `start` raises it, too, if the buffer
+            does not fit on the device.
         """
         if self.her and not isinstance(task, GoToGoal):
-            raise BadInput("HER relabels goals, and this task has none")
+            raise BadInput("HER relabels goals, but this task has no goals")
         algorithm = self.algorithm(robot, input_size(robot, task))
         rollout = functools.partial(_rollout, robot, task, algorithm, self.unroll_length)
         learn = functools.partial(self._learn, robot, task, algorithm)
@@ -187,10 +188,10 @@ class OffPolicy(LearningAgent):
         training: TrainingState,
         part: ReplayTransition,
     ) -> tuple[TrainingState, Metrics]:
-        """Takes `part [unroll_length, lanes, ...]` in; makes `grad_updates_per_step` updates."""
+        """Add `part [unroll_length, num_envs, ...]`; make `grad_updates_per_step` updates."""
         buffer = add(training.buffer, part)
-        fed = inputs(part.s, None if part.goal is None else part.goal - part.o)
-        statistics = running_statistics.update(training.statistics, fed)
+        observation = inputs(part.s, None if part.goal is None else part.goal - part.o)
+        statistics = running_statistics.update(training.statistics, observation)
         left = steps_left(buffer)
 
         def update(tree: Any, key: jax.Array) -> tuple[Any, Metrics]:
@@ -215,16 +216,17 @@ class OffPolicy(LearningAgent):
     def sample(
         self, robot: Robot, task: Task, buffer: Buffer, left: jax.Array, key: jax.Array
     ) -> BraxTransition:
-        """A minibatch `[batch, ...]`, its goals relabelled if there is HER, and judged anew.
+        """Sample a minibatch `[batch_size, ...]`; with HER, relabel goals and recompute rewards.
 
-        A step at the time limit is no end: it is marked as truncated, and not learned from.
+        A step at the time limit is not terminal: it is marked as truncated, and the losses
+        ignore it.
         """
         where, what = jax.random.split(key)
         at = sample_index(buffer, where, self.batch_size)
         rows, s_next = gather(buffer, at)
         goal, outcome = rows.goal, Outcome(rows.reward, rows.terminal, rows.absorbing_reward)
         if self.her:
-            assert isinstance(task, GoToGoal)  # `learning` has refused the others
+            assert isinstance(task, GoToGoal)  # `programs` refuses other tasks
             goal = self.her.goal(buffer, left, at, what, robot.standing_height)
             outcome = task.outcome(robot, rows.o, rows.o_next, goal, rows.cost, rows.fallen)
         before, after = (None, None) if goal is None else (goal - rows.o, goal - rows.o_next)
@@ -242,8 +244,8 @@ def _check_room(buffer: Buffer) -> None:
     size = sum(x.nbytes for x in jax.tree.leaves(buffer))
     room = devices.memory() or devices.host_memory()
     if 1.2 * size > room:
-        needs = f"the replay buffer needs {size / 1e9:.1f} GB, of {room / 1e9:.1f} on the device"
-        raise BadInput(f"{needs}: give the agent a smaller max_replay_size")
+        needs = f"the replay buffer needs {size / 1e9:.1f} GB; the device has {room / 1e9:.1f} GB"
+        raise BadInput(f"{needs}. Set a smaller max_replay_size")
 
 
 def _rollout(
@@ -255,7 +257,7 @@ def _rollout(
     policy: Any,
     lanes: EnvState,
 ) -> tuple[EnvState, Experience, ReplayTransition, Metrics]:
-    """`unroll_length` steps of every lane, exploring; outputs `[unroll_length, B, ...]`."""
+    """Step every lane with exploration; outputs are `[unroll_length, B, ...]`."""
 
     def choose(x: jax.Array, noise: Any) -> tuple[jax.Array, None]:
         return algorithm.act(statistics, policy, x, noise), None

@@ -1,4 +1,4 @@
-"""What an agent has learned, as a controller: (s, g − o) → a, without exploration."""
+"""A learned policy as a controller: (s, g − o) → a, without exploration."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ ACTIVATIONS: dict[Activation, Callable[[jax.Array], jax.Array]] = {
     "relu": linen.relu,
 }
 
-# Normalised inputs are kept within ± this, for the networks of all agents.
+# All agents use this function, so that a saved policy normalises as in training.
 normalize = functools.partial(running_statistics.normalize, max_abs_value=10.0)
 
 
 def no_statistics(size: int) -> RunningStatisticsState:
-    """Of no inputs yet; of strong types, as those from a checkpoint: one program serves both."""
+    """Initial statistics of `size` inputs; strongly typed, so that a resume does not recompile."""
     state = running_statistics.init_state(jnp.zeros(size, jnp.float32))
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
 
 def described(robot: Robot) -> dict[str, Any]:
-    """What a controller's directory says of its robot: the name, and what it sees and does."""
+    """The robot's name, observation and action fields, as a controller's directory stores them."""
     return {
         "robot": robot.name,
         "observation": robot.observation.listed(),
@@ -50,13 +50,13 @@ class Policy(flax.struct.PyTreeNode):
     """The mean action of a trained policy network, squashed by tanh.
 
     Attributes:
-      params: of Brax's policy network; its first A outputs are the mean.
-      mean: `[I]`, of the inputs seen while learning.
-      std: `[I]`.
-      policy_hidden_layer_sizes: layers of the network.
-      activation: of the hidden layers.
-      goal_conditioned: fed (s, g − o); s alone otherwise.
-      robot: the robot that it was trained on.
+      params: parameters of Brax's policy network; its first A outputs are the mean.
+      mean: `[I]`, mean of the training inputs.
+      std: `[I]`, standard deviation of the training inputs.
+      policy_hidden_layer_sizes: widths of the hidden layers.
+      activation: activation of the hidden layers.
+      goal_conditioned: whether the input is (s, g − o); if not, it is s.
+      robot: the robot that the policy controls.
     """
 
     params: Any
@@ -68,10 +68,10 @@ class Policy(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
-        """Actions `[..., A]` for states `[..., S]` and ways to the goal `[..., 3]`, metres.
+        """Actions `[..., A]` for states `[..., S]` and relative goals `[..., 3]`, metres.
 
         Raises:
-          BadInput: their shapes do not fit the robot, or each other.
+          BadInput: the shapes do not fit the robot or each other, or a number is not finite.
         """
         s = self.robot.check_inputs(s, relative_goal)
         x = inputs(s, relative_goal if self.goal_conditioned else None)
@@ -80,16 +80,16 @@ class Policy(flax.struct.PyTreeNode):
         return jnp.tanh(out[..., : self.robot.action.size])
 
     def _network(self) -> MLP:
-        """Its outputs are the mean and, of agents that explore by a Gaussian, the deviation."""
+        """The policy network: it outputs the mean and, for PPO and SAC, the standard deviation."""
         outputs = self.params["params"][f"hidden_{len(self.policy_hidden_layer_sizes)}"][
             "bias"
         ].shape[-1]
         if outputs not in (self.robot.action.size, 2 * self.robot.action.size):
-            raise ValueError(f"its network has {outputs} outputs")
+            raise ValueError(f"the policy network has {outputs} outputs")
         return MLP((*self.policy_hidden_layer_sizes, outputs), ACTIVATIONS[self.activation])
 
     def fresh(self, key: jax.Array) -> dict[str, Any]:
-        """Parameters and statistics of the shapes that these have, untrained."""
+        """Untrained parameters and statistics of the same shapes."""
         size = self.robot.observation.size + 3 * self.goal_conditioned
         params = self._network().init(key, jnp.zeros(size, jnp.float32))
         return {
@@ -99,10 +99,10 @@ class Policy(flax.struct.PyTreeNode):
         }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
-        """Writes the policy as a directory, without pickle.
+        """Write the policy as a directory, without pickle.
 
         Raises:
-          BadInput: there is something already, and `overwrite` is not set.
+          BadInput: the path exists, and `overwrite` is False.
         """
         leaves = jax.tree.map(
             np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
@@ -116,10 +116,10 @@ class Policy(flax.struct.PyTreeNode):
 
     @classmethod
     def restore(cls, tree: dict[str, Any], meta: dict[str, Any], robot: Robot) -> Policy:
-        """The policy that `save` wrote, from what lies in its directory.
+        """Rebuild the policy from the arrays and the metadata that `save` wrote.
 
         Raises:
-          BadInput: what it says of its network cannot be.
+          BadInput: the metadata of the network is not valid.
         """
         for name, allowed in (
             ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),

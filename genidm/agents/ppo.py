@@ -1,11 +1,10 @@
-"""PPO (Schulman et al. 2017), composed from Brax's networks, losses and statistics.
+"""PPO (Schulman et al. 2017), built from Brax's networks, losses and statistics.
 
-An iteration is two programs. In the first every device steps its own lanes; in the second
-the running statistics take the new inputs in, and the networks learn from the batch in
-`num_updates_per_batch` passes, on one device: networks this small learn faster than their gradients
-could be averaged (four CPU devices: 0.3 s an iteration instead of 0.6), what is learned does not
-depend on the number of devices, and no program waits for another device, which XLA's collectives on
-a CPU can do forever when cores are scarce.
+An iteration has two programs. In the first, every device steps its own lanes. In the second,
+one device updates the input statistics and makes `num_updates_per_batch` passes over the batch.
+Only one device learns, for three reasons. With networks this small it is faster than four CPU
+devices that average their gradients (0.3 s per iteration instead of 0.6). The result does not
+depend on the number of devices. XLA's collectives on a CPU can deadlock when cores are scarce.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from genidm.experience import Experience
 from genidm.robots.base import Robot
 from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size, inputs
 
-# Of what Brax's loss reports, what is worth a curve.
+# The metrics of Brax's loss that are logged.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
 
 
 class TrainingState(flax.struct.PyTreeNode):
-    """What learns: networks, their optimizer, the statistics of the states, a key."""
+    """Network parameters, optimizer state, statistics of the inputs and a random key."""
 
     params: PPONetworkParams
     optimizer: Any
@@ -51,7 +50,7 @@ class TrainingState(flax.struct.PyTreeNode):
 
     @property
     def actor_params(self) -> tuple[RunningStatisticsState, Any]:
-        """What chooses actions."""
+        """Statistics and policy parameters: all that a rollout needs."""
         return self.statistics, self.params.policy
 
 
@@ -60,20 +59,20 @@ class PPO(LearningAgent):
     """Settings of PPO.
 
     Attributes:
-      num_envs: robots at once.
-      unroll_length: steps an iteration; num_envs × unroll_length transitions are learned from at a
-        time.
+      num_envs: number of lanes: environments that step together.
+      unroll_length: environment steps per lane in one iteration; a batch has num_envs ×
+        unroll_length transitions.
       num_updates_per_batch: passes over each batch.
-      num_minibatches: parts of the batch, each of num_envs / num_minibatches lanes.
-      learning_rate: of Adam.
-      discounting: of rewards, a step.
+      num_minibatches: minibatches per pass, each of num_envs / num_minibatches lanes.
+      learning_rate: learning rate of Adam.
+      discounting: discount factor γ per step.
       gae_lambda: λ of generalised advantage estimation.
-      clipping_epsilon: of the policy's ratio.
+      clipping_epsilon: clipping range ε of the probability ratio.
       entropy_cost: weight of the entropy bonus.
-      reward_scaling: rewards are multiplied by it before the value function sees them.
-      policy_hidden_layer_sizes: layers of the policy (Table 2: 64×64).
-      value_hidden_layer_sizes: layers of the value function.
-      max_grad_norm: gradients are clipped to this norm.
+      reward_scaling: factor for rewards.
+      policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
+      value_hidden_layer_sizes: widths of the value function's hidden layers.
+      max_grad_norm: maximum norm of the gradients; larger ones are clipped.
     """
 
     activation: ClassVar[Activation] = "tanh"
@@ -110,13 +109,13 @@ class PPO(LearningAgent):
             max_grad_norm=positive(),
         )
         if self.num_envs % self.num_minibatches:
-            uneven = (
-                f"{self.num_envs} lanes cannot be shared among {self.num_minibatches} minibatches"
+            raise BadInput(
+                f"num_envs {self.num_envs} must be a multiple of "
+                f"num_minibatches {self.num_minibatches}"
             )
-            raise BadInput(f"{uneven} evenly")
 
     def networks(self, robot: Robot, task: Task) -> ppo_networks.PPONetworks:
-        """Brax's policy and value networks on normalised inputs."""
+        """Brax's policy and value networks, with normalised inputs."""
         return ppo_networks.make_ppo_networks(
             input_size(robot, task),
             robot.action.size,
@@ -127,7 +126,7 @@ class PPO(LearningAgent):
         )
 
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
-        """The two programs of an iteration."""
+        """The rollout and learning programs of an iteration."""
         networks = self.networks(robot, task)
         optimizer = optax.chain(
             optax.clip_by_global_norm(self.max_grad_norm), optax.adam(self.learning_rate)
@@ -161,7 +160,7 @@ class PPO(LearningAgent):
         training: TrainingState,
         batch: BraxTransition,
     ) -> tuple[TrainingState, Metrics]:
-        """Learns from a batch `[unroll_length, lanes, ...]`, in shuffled minibatches."""
+        """Learn from a batch `[unroll_length, num_envs, ...]`, in shuffled minibatches."""
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
         statistics = running_statistics.update(training.statistics, batch.observation)
         loss = functools.partial(
@@ -209,7 +208,7 @@ def _rollout(
     policy: Any,
     lanes: EnvState,
 ) -> tuple[EnvState, Experience, BraxTransition, Metrics]:
-    """Steps every lane under the policy's own noise; outputs `[unroll_length, B, ...]`."""
+    """Step every lane with sampled actions; outputs are `[unroll_length, B, ...]`."""
     distribution = networks.parametric_action_distribution
 
     def draw(key: jax.Array) -> jax.Array:
@@ -242,17 +241,17 @@ def _rollout(
 def brax_transition(
     experience: Experience, kept: dict[str, Any], lanes: EnvState
 ) -> BraxTransition:
-    """What Brax's loss reads of steps `[T, B]`.
+    """Convert steps `[T, B]` to the transition that Brax's loss reads.
 
     Args:
       experience: the steps.
-      kept: what PPO has kept of them.
-      lanes: EnvState `[B]` after the last step. The loss asks for the value of its state alone, and
-        not at all where the last step has ended an episode.
+      kept: PPO's data for the loss, arrays `[T, B, ...]`.
+      lanes: EnvState `[B]` after the last step. The loss reads only the value of this state, and
+        ignores it where the last step ended an episode.
     """
     goal = kept["goal"]
     after = inputs(lanes.robots.observation, lanes.relative_goal)
-    choice = ("distribution_params", "raw_action", "log_prob")
+    policy_fields = ("distribution_params", "raw_action", "log_prob")
     return BraxTransition(
         observation=inputs(experience.s, None if goal is None else goal - experience.o),
         action=experience.a,
@@ -260,12 +259,12 @@ def brax_transition(
         discount=kept["discount"],
         next_observation=after[None],
         extras={
-            "policy_extras": {name: kept[name] for name in choice},
+            "policy_extras": {name: kept[name] for name in policy_fields},
             "state_extras": {"truncation": kept["truncation"]},
         },
     )
 
 
 def _shuffled(batch: Any, order: jax.Array, parts: int) -> Any:
-    """A batch `[B, ...]` in the given order, as `[parts, B / parts, ...]`."""
+    """Reorder a batch `[B, ...]` and split it into `[parts, B / parts, ...]`."""
     return jax.tree.map(lambda x: x[order].reshape(parts, -1, *x.shape[1:]), batch)

@@ -1,4 +1,4 @@
-"""Random sampling (RS, §5.1): actions drawn at random at each step."""
+"""Random sampling (RS, §5.1): a new random action at each step."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class RandomActions(Agent):
     """Uniform actions in [−1, 1].
 
     Attributes:
-      num_envs: robots at once.
-      unroll_length: steps an iteration.
+      num_envs: number of lanes: environments that step together.
+      unroll_length: environment steps per lane in one iteration.
     """
 
     num_envs: int = 128
@@ -35,7 +35,7 @@ class RandomActions(Agent):
         check(self, num_envs=count(), unroll_length=count())
 
     def policy(self, robot: Robot, task: Task, learner: EnvState) -> None:
-        """There is none: nothing is learned."""
+        """None: this agent does not learn."""
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         def draw(key: jax.Array) -> jax.Array:
@@ -45,7 +45,7 @@ class RandomActions(Agent):
             return drawn, None
 
         def keep(step: Transition, notes: None) -> None:
-            """Nothing: nothing is learned."""
+            """None: this agent does not learn."""
 
         stepping = functools.partial(
             generate_unroll, robot, task, self.unroll_length, draw, choose, keep
@@ -57,7 +57,7 @@ class RandomActions(Agent):
         def prepare(lanes: EnvState) -> Iterate:
             sharded = devices.over_lanes(stepping, mesh, [0], (0, 1, 1, 1))
             jitted = jax.jit(sharded, donate_argnums=0)
-            program = compile_ahead("random stepping", jitted, lanes)
+            program = compile_ahead("rollout of random actions", jitted, lanes)
 
             def iterate(lanes: EnvState) -> tuple[EnvState, Experience, Metrics]:
                 lanes, experience, _, seen = program(lanes)

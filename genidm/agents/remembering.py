@@ -1,9 +1,8 @@
-"""Checkpoints of a learner that may hold a replay buffer, whose rows are written once.
+"""Checkpoints that write each row of a replay buffer only once.
 
-A buffer is far larger than all else that a learner is, and little of it is new from one
-checkpoint to the next. So what is new lies beside the checkpoints in parts, each the rows of one
-stretch of time; a checkpoint names the parts that make up its buffer, and a part goes when all
-its rows have been written over.
+A buffer is far larger than the rest of a learner, and only few of its rows are new at each
+checkpoint. So the new rows are saved as a separate part. A checkpoint lists the parts of its
+buffer. A part is deleted when the buffer holds none of its rows any more.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from genidm.checkpoints import Checkpoints
 
 
 class Remembering:
-    """What `Checkpoints` does, for a tree that holds one Buffer at most."""
+    """`Checkpoints` for a tree that holds at most one Buffer."""
 
     def __init__(self, checkpoints: Checkpoints):
         self.checkpoints = checkpoints
         self._parts: list[str] = []
 
     def save(self, step: int, tree: Any) -> None:
-        """See `Checkpoints.save`; of the buffer only what is new since the last one is written."""
+        """See `Checkpoints.save`; of the buffer, write only the rows since the last checkpoint."""
         for buffer in buffers(tree):
             self._append(buffer)
         self.checkpoints.save(step, emptied(tree), self._parts)
@@ -38,8 +37,8 @@ class Remembering:
         if since < written:
             rows = newest(buffer, written - since)
             name = f"{since:010d}_{written:010d}"
-            there = {field: x for field, x in vars(rows).items() if x is not None}
-            self.checkpoints.save_part(name, there)
+            arrays = {field: x for field, x in vars(rows).items() if x is not None}
+            self.checkpoints.save_part(name, arrays)
             self._parts.append(name)
 
     def latest(self, like: Any) -> tuple[int, Any] | None:
@@ -52,7 +51,7 @@ class Remembering:
         return step, _exchanged(tree, self._filled)
 
     def _filled(self, buffer: Buffer) -> Buffer:
-        """An emptied buffer with its rows."""
+        """Load the rows of an emptied buffer from its parts."""
         rows = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), buffer.rows)
         for part in self._parts:
             at = np.arange(*_span(part)) % len(rows.last)
@@ -62,7 +61,7 @@ class Remembering:
 
 
 def _span(part: str) -> tuple[int, int]:
-    """The first row of a part, and the one after its last, of all that were ever written."""
+    """Numbers of the first row of a part and of the row after its last, since the start."""
     first, end = part.split("_")
     return int(first), int(end)
 
@@ -77,7 +76,7 @@ def buffers(tree: Any) -> list[Buffer]:
 
 
 def emptied(tree: Any) -> Any:
-    """The tree with `[0, T, B, ...]` for the rows of its buffers: their shapes and no more."""
+    """The tree with arrays `[0, T, B, ...]` as rows of its buffers: they keep only the shapes."""
     return _exchanged(tree, lambda b: b.replace(rows=jax.tree.map(_no_elements, b.rows)))
 
 

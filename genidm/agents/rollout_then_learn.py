@@ -1,4 +1,4 @@
-"""What all learners share: in an iteration every device steps its own lanes, then one learns."""
+"""The iteration of all learning agents: all devices step their lanes, then one device learns."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from genidm.tasks import EnvState, Task
 
 
 class AgentState(flax.struct.PyTreeNode):
-    """All that is carried from one iteration to the next.
+    """The state of an agent between two iterations: what `Learning` calls a learner.
 
     Attributes:
-      env_state: the robots.
-      training_state: what learns. Its `actor_params` choose actions: (statistics of the inputs,
+      env_state: state of the environments.
+      training_state: the agent's TrainingState. Its `actor_params` are (statistics of the inputs,
         parameters of the policy network).
     """
 
@@ -40,12 +40,12 @@ class RolloutThenLearn:
     """An iteration of two programs: all devices step, then one learns and the others wait.
 
     Attributes:
-      title: what the learner is called in messages.
-      start: key → learner.
-      rollout: (statistics, policy, lanes `[B]`) → (lanes, Experience, what is learned from,
-        metrics), all but the lanes `[unroll_length, B, ...]`.
-      learn: (training state, what is learned from) → (training state, losses).
-      mesh: the devices that share the lanes; its first one learns.
+      title: name of the agent in messages.
+      start: key → AgentState.
+      rollout: (statistics, policy, lanes `[B]`) → (lanes, Experience, batch, metrics); all but
+        the lanes are `[unroll_length, B, ...]`.
+      learn: (training state, batch) → (training state, losses).
+      mesh: the devices that share the lanes; the first of them learns.
     """
 
     title: str
@@ -56,7 +56,7 @@ class RolloutThenLearn:
 
     @functools.cached_property
     def stepping(self) -> Any:
-        """The first program: `rollout`, each device with its own lanes, which it donates."""
+        """The first program: `rollout`, sharded over the lanes; it donates the lanes."""
         sharded = devices.over_lanes(self.rollout, self.mesh, [None, None, 0], (0, 1, 1, 1))
         return jax.jit(sharded, donate_argnums=2)
 
@@ -66,7 +66,7 @@ class RolloutThenLearn:
         return jax.jit(self.learn, donate_argnums=0)
 
     def acting(self, training: Any) -> tuple[Any, Any]:
-        """What chooses actions, a copy on every device."""
+        """Copy the statistics and policy parameters to every device."""
         return devices.put(training.actor_params, self.mesh, None)
 
     def place(self, learner: AgentState) -> AgentState:
@@ -77,10 +77,10 @@ class RolloutThenLearn:
 
     def prepare(self, learner: AgentState) -> Iterate:
         args = (*self.acting(learner.training_state), learner.env_state)
-        step = compile_ahead(f"{self.title}'s stepping", self.stepping, *args)
+        step = compile_ahead(f"rollout of {self.title}", self.stepping, *args)
         batch = jax.eval_shape(self.stepping, *args)[2]
         update = compile_ahead(
-            f"{self.title}'s learning", self.updating, learner.training_state, batch
+            f"learning of {self.title}", self.updating, learner.training_state, batch
         )
 
         def iterate(learner: AgentState) -> tuple[AgentState, Experience, Metrics]:
@@ -93,7 +93,7 @@ class RolloutThenLearn:
         return iterate
 
     def learning(self) -> Learning:
-        """As `collect` asks for it."""
+        """The functions that `collect` needs."""
         return Learning(self.start, self.place, self.prepare)
 
 
@@ -101,8 +101,8 @@ class LearningAgent(Agent):
     """Settings of an agent whose iteration is RolloutThenLearn.
 
     Attributes:
-      activation: of the policy's hidden layers.
-      policy_hidden_layer_sizes: layers of the policy.
+      activation: activation of the policy's hidden layers.
+      policy_hidden_layer_sizes: widths of the policy's hidden layers.
     """
 
     activation: ClassVar[Activation]
@@ -110,13 +110,13 @@ class LearningAgent(Agent):
 
     @abc.abstractmethod
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
-        """The two programs of an iteration."""
+        """The rollout and learning programs of an iteration."""
 
     def learning(self, robot: Robot, task: Task, mesh: Mesh) -> Learning:
         return self.programs(robot, task, mesh).learning()
 
     def policy(self, robot: Robot, task: Task, learner: AgentState) -> Policy:
-        """The policy of a learner, without exploration."""
+        """The learned policy, without exploration."""
         statistics, params = learner.training_state.actor_params
         statistics = narrow(statistics)
         return Policy(

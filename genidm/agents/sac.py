@@ -1,4 +1,4 @@
-"""SAC (Haarnoja et al. 2018), composed from Brax's networks and losses."""
+"""SAC (Haarnoja et al. 2018), with Brax's networks and losses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from genidm.robots.base import Robot
 
 
 class SACState(flax.struct.PyTreeNode):
-    """Parameters of policy, critics, their targets and the temperature, and the optimizers."""
+    """Parameters of policy, critics, their targets and temperature, and optimizer states."""
 
     policy: Any
     critic: Any
@@ -37,16 +37,16 @@ class SACState(flax.struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class SAC(OffPolicy):
-    """Settings of SAC; the temperature is tuned towards an entropy of −A / 2, as Brax does.
+    """Settings of SAC; the temperature is tuned for a target entropy of −A / 2, as in Brax.
 
     Attributes:
-      layer_norm: the critics' layers are normalised, which makes more of each update.
+      layer_norm: layer normalisation in the critics, which makes them learn in fewer updates.
     """
 
     layer_norm: bool = False
 
     def networks(self, robot: Robot, size: int) -> SACNetworks:
-        """Brax's policy and two critics on normalised inputs."""
+        """Brax's policy network and two critics, with normalised inputs."""
         distribution = NormalTanhDistribution(event_size=robot.action.size)
         return SACNetworks(
             make_policy_network(
@@ -75,7 +75,7 @@ class SAC(OffPolicy):
             policy = networks.policy_network.init(policy_key)
             critic = networks.q_network.init(critic_key)
             log_alpha = jnp.zeros((), jnp.float32)
-            # The target is a copy: one buffer cannot be donated twice.
+            # The target must be a copy, because jax cannot donate one array twice.
             target = jax.tree.map(jnp.copy, critic)
             states = (adam.init(x) for x in (policy, critic, log_alpha))
             return SACState(policy, critic, target, log_alpha, *states)

@@ -1,4 +1,4 @@
-"""An agent's steps: what acts, episode after episode, and the record of it."""
+"""Rollouts for training: consecutive episodes, with a record of every step."""
 
 from __future__ import annotations
 
@@ -17,50 +17,50 @@ from genidm.tasks import EnvState, Task, Transition, inputs
 
 # key → the random numbers of one action.
 Draw = Callable[[jax.Array], Any]
-# (inputs [B, I], random numbers [B, ...]) → (a [B, A], notes).
+# (inputs [B, I], random numbers [B, ...]) → (a [B, A], notes for Keep).
 Choose = Callable[[jax.Array, Any], tuple[jax.Array, Any]]
-# (step [B], notes) → what a learner needs of it, [B, ...].
+# (step [B], notes) → what the learner needs of the step, [B, ...].
 Keep = Callable[[Transition, Any], Any]
 
 
 class _Carry(flax.struct.PyTreeNode):
-    """Lanes, and the starts that they take when their episodes end.
+    """Lanes, and their next initial states.
 
     Attributes:
       lanes: EnvState `[B]`.
-      fresh: EnvState `[B]`, ready to start.
-      spent: `[B]` bool, whether the lane has taken its fresh start already.
+      fresh: EnvState `[B]` at the start of the lanes' next episodes.
+      used: `[B]` bool, whether the lane has used its fresh state.
     """
 
     lanes: EnvState
     fresh: EnvState
-    spent: jax.Array
+    used: jax.Array
 
 
 def generate_unroll(
     robot: Robot, task: Task, steps: int, draw: Draw, choose: Choose, keep: Keep, lanes: EnvState
 ) -> tuple[EnvState, Experience, Any, Metrics]:
-    """T steps of B lanes; where an episode ends, a fresh one begins.
+    """Step B lanes T times; when an episode ends, its lane starts a new one.
 
-    Starts and random numbers are drawn before the loop, not in every step. They belong to
-    the lanes' own keys, so that they do not depend on how lanes are shared among devices.
+    Initial states and random numbers are drawn before the loop, because a reset of all lanes in
+    every step is slow. They come from the lanes' own keys, so they do not depend on the mesh.
 
     Args:
-      robot: what walks.
-      task: what ends an episode, and what it pays.
+      robot: the robot.
+      task: reward and end of an episode.
       steps: T.
-      draw: the random numbers of an action.
-      choose: the action.
-      keep: what the learner needs of a step.
+      draw: draws the random numbers for an action.
+      choose: chooses the action.
+      keep: selects what the learner needs of a step.
       lanes: EnvState `[B]` before the first step.
 
     Returns:
-      the lanes after the last step; the record, what was kept, and the task's metrics,
-      `[T, B, ...]` each.
+      EnvState `[B]` after the last step; Experience, the results of `keep`, and the task's
+      metrics, `[T, B, ...]` each.
     """
     keys = jax.vmap(lambda key: jax.random.split(key, 3))(lanes.keys)
-    of_steps = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys[:, 1])
-    rows = jax.vmap(jax.vmap(draw))(of_steps)
+    step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys[:, 1])
+    rows = jax.vmap(jax.vmap(draw))(step_keys)
     fresh = task.start(robot, keys[:, 2])
     carry = _Carry(lanes.replace(keys=keys[:, 0]), fresh, jnp.zeros(lanes.episode_step.shape, bool))
 
@@ -72,22 +72,23 @@ def generate_unroll(
     def watch(carry: _Carry, move: Move) -> tuple[_Carry, Any]:
         seen = task.transition(robot, carry.lanes, move.action, move.after)
         kept = record(seen), keep(seen, move.notes), task.metrics(robot, seen)
-        return _go_on(robot, task, carry, seen), kept
+        return _reset_ended(robot, task, carry, seen), kept
 
     carry, kept = rollout(robot, act, watch, carry, rows)
     return (carry.lanes, *narrow(kept))
 
 
-def _go_on(robot: Robot, task: Task, carry: _Carry, seen: Transition) -> _Carry:
-    """Lanes whose episode has ended take their fresh starts."""
+def _reset_ended(robot: Robot, task: Task, carry: _Carry, seen: Transition) -> _Carry:
+    """Replace the lanes whose episode has ended by their fresh states."""
 
-    def renewed() -> tuple[EnvState, jax.Array]:
-        # The fourth of a key of which `generate_unroll` splits three.
+    def refill() -> tuple[EnvState, jax.Array]:
+        # A fourth key, because `generate_unroll` uses the first three.
         keys = jax.vmap(lambda key: jax.random.split(key, 4)[3])(carry.fresh.keys)
-        fresh = select(carry.spent, task.start(robot, keys), carry.fresh)
-        return fresh, jnp.zeros_like(carry.spent)
+        fresh = select(carry.used, task.start(robot, keys), carry.fresh)
+        return fresh, jnp.zeros_like(carry.used)
 
-    short = (seen.last & carry.spent).any()
-    fresh, spent = jax.lax.cond(short, renewed, lambda: (carry.fresh, carry.spent))
+    # Only if a lane ends a second episode in one rollout, draw new fresh states in the loop.
+    none_left = (seen.last & carry.used).any()
+    fresh, used = jax.lax.cond(none_left, refill, lambda: (carry.fresh, carry.used))
     going = carry.lanes.replace(robots=seen.after, episode_step=carry.lanes.episode_step + 1)
-    return _Carry(select(seen.last, fresh, going), fresh, spent | seen.last)
+    return _Carry(select(seen.last, fresh, going), fresh, used | seen.last)

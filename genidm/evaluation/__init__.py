@@ -1,1 +1,1 @@
-"""The paper's test (A.1.3), waypoints (§5.3), and what is computed from their episodes."""
+"""The paper's test (A.1.3), waypoints (§5.3), and the statistics of their episodes."""

@@ -1,4 +1,4 @@
-"""What an evaluation leaves behind; every table and figure derives from it."""
+"""Results of an evaluation; every table and figure is made from them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """The outcome of each test episode, arrays `[seeds, episodes]` (A.1.3).
+    """The results of test episodes, arrays `[seeds, episodes]` (A.1.3).
 
     Attributes:
-      closest: metres; least horizontal distance to the target, the paper's measure.
-      start: metres; horizontal distance at the start.
-      reached: bool; came within the goal radius.
-      fell: bool; ended by a fall.
-      diverged: bool; ended because the physics left the finite numbers.
-      steps: int; control steps made.
-      path_length: metres; horizontal length of the way.
+      closest: metres; smallest horizontal distance to the target, the paper's measure.
+      start: metres; horizontal distance to the target at the start.
+      reached: bool; the robot came within the goal radius.
+      fell: bool; a fall ended the episode.
+      diverged: bool; non-finite physics ended the episode.
+      steps: int; environment steps.
+      path_length: metres; horizontal length of the path.
     """
 
     closest: np.ndarray

@@ -1,4 +1,4 @@
-"""The paper's test (A.1.3): closest distance to the target, over scenarios."""
+"""The paper's test (A.1.3): closest distance to the target in every scenario."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def evaluate(
     stage: Stage | None = None,
     quiet: bool = False,
 ) -> Episodes:
-    """Runs every scenario to its end.
+    """Run every scenario to its end (A.1.3).
 
-    The controller is asked anew at each step (A.1.3: "we replan at each step").
+    The controller computes a new action at each step (A.1.3: "we replan at each step").
 
     Args:
-      robot: what is steered.
-      controller: what steers it.
+      robot: robot to control.
+      controller: (s, relative goal) → a.
       scenarios: scenarios `[seeds, episodes]`.
       settings: length of an episode, goal radius, lanes.
-      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
-      stage: where checkpoints and metrics go; nowhere, unless given.
-      quiet: no progress bar.
+      mesh: devices that share the lanes; None takes those of the robot's engine.
+      stage: where to write checkpoints and metrics; None writes nothing.
+      quiet: do not show a progress bar.
     """
     results, _ = run(
         robot, controller, flatten(scenarios), settings, mesh=mesh, stage=stage, quiet=quiet
@@ -62,7 +62,7 @@ def trace(
     scenarios: Scenarios,
     settings: EvaluationSettings | None = None,
 ) -> tuple[Episodes, list[np.ndarray]]:
-    """`evaluate`, and the trajectory `[steps + 1, 3]` of every episode, in the scenarios' order."""
+    """`evaluate`, and the trajectory `[steps + 1, 3]` of each episode in metres."""
     results, trajectories = run(
         robot, controller, flatten(scenarios), settings, traced=scenarios.yaw.size, quiet=True
     )
@@ -72,17 +72,17 @@ def trace(
 def walking_speed(
     robot: Robot, policy: ControllerFn, episodes: int = 100, seed: int = 0
 ) -> np.ndarray:
-    """Speed towards +x of a policy that learned to walk there, `[episodes]`, m/s.
+    """Measure the speed of a policy towards +x, `[episodes]`, m/s.
 
     Each episode starts as in training and ends with a fall, or after 1000 steps.
 
     Raises:
-      BadInput: there is no episode, or too many; or the seed has no 32 bits.
+      BadInput: `episodes` is not in [1, `MOST_EPISODES`], or the seed is not of 32 bits.
     """
     check_value("episodes", episodes, count(1, MOST_EPISODES))
     check_value("seed", seed, checks.seed())
     keys = jax.random.split(jax.random.key(seed), (1, episodes))
-    # A target that is out of reach: what is gained on it is the way walked.
+    # The target is out of reach, so the distance gained on it is the distance walked.
     target = jnp.broadcast_to(jnp.asarray([1e4, 0.0, 0.0], jnp.float32), (1, episodes, 3))
     results = evaluate(
         robot, policy, Scenarios(keys, jnp.zeros((1, episodes), jnp.float32), target)
@@ -102,48 +102,48 @@ def run(
     stage: Stage | None = None,
     quiet: bool = False,
 ) -> tuple[EpisodeResults, list[Any]]:
-    """`evaluate` on scenarios `[N]`, the first of them traced.
+    """`evaluate` on scenarios `[N]`, with traces of the first episodes.
 
     Args:
-      robot: what is steered.
-      controller: what steers it.
+      robot: robot to control.
+      controller: (s, relative goal) → a.
       scenarios: scenarios `[N]` (`flatten`).
       settings: length of an episode, goal radius, lanes.
-      traced: how many of the first episodes to give the traces of.
-      record: what a trace keeps of each state; the position, unless given.
-      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
-      stage: where checkpoints and metrics go; nowhere, unless given.
-      quiet: no progress bar.
+      traced: number of the first episodes to trace.
+      record: what a trace keeps of each state; by default the position.
+      mesh: devices that share the lanes; None takes those of the robot's engine.
+      stage: where to write checkpoints and metrics; None writes nothing.
+      quiet: do not show a progress bar.
 
     Returns:
-      outcomes `[N]`, and for each traced episode a tree `[steps + 1, ...]` of what was kept.
+      results `[N]`, and the trace of each traced episode, a tree `[steps + 1, ...]`.
     """
     evaluator = Evaluator(
         robot, scenarios, settings or EvaluationSettings(), mesh or robot.mesh(), traced, record
     )
-    queue, calls = evaluator.start(), 0
-    # Its queues belong to the devices: on others the test begins anew.
-    here = f"{evaluator.mesh.size}_devices_{queue.running.episode.size}_lanes"
+    state, calls = evaluator.start(), 0
+    # A state is laid out for its devices and lanes: with others the test starts again.
+    here = f"{evaluator.mesh.size}_devices_{state.running.episode.size}_lanes"
     checkpoints = stage.checkpoints(here) if stage else None
-    found = checkpoints.latest(queue) if checkpoints else None
+    found = checkpoints.latest(state) if checkpoints else None
     if found:
-        calls, queue = found[0], devices.put(found[1], evaluator.mesh)
-    step = evaluator.prepare(controller, queue)
-    done = evaluator.ended(queue)
+        calls, state = found[0], devices.put(found[1], evaluator.mesh)
+    step = evaluator.prepare(controller, state)
+    done = evaluator.ended(state)
     directory = stage.directory if stage else None
     with Progress("evaluate", evaluator.total, "episodes", directory, done, quiet) as bar:
         while done < evaluator.total:
-            queue, calls = step(queue), calls + 1
-            before, done = done, evaluator.ended(queue)
-            useful, longest = evaluator.useful(queue, calls), evaluator.longest(queue)
+            state, calls = step(state), calls + 1
+            before, done = done, evaluator.ended(state)
+            useful, longest = evaluator.useful(state, calls), evaluator.longest(state)
             bar.advance(done - before, useful=useful, longest=longest)
             if checkpoints and checkpoints.due():
-                checkpoints.save(calls, queue)
-    return evaluator.results(queue), evaluator.traces(queue)
+                checkpoints.save(calls, state)
+    return evaluator.results(state), evaluator.traces(state)
 
 
 def flatten(*scenarios: Scenarios) -> Scenarios:
-    """Scenarios `[seeds, episodes]` one after another, as scenarios `[N]`."""
+    """Concatenate scenarios `[seeds, episodes]` to scenarios `[N]`."""
 
     def join(*parts: Any) -> Any:
         return jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in parts])
@@ -152,6 +152,6 @@ def flatten(*scenarios: Scenarios) -> Scenarios:
 
 
 def episodes(results: EpisodeResults, shape: tuple[int, int]) -> Episodes:
-    """Outcomes `[seeds × episodes]` as Episodes `[seeds, episodes]`."""
+    """Reshape results `[seeds × episodes]` to Episodes `[seeds, episodes]`."""
     names = [f.name for f in dataclasses.fields(EpisodeResults)]
     return Episodes(**{name: np.asarray(getattr(results, name)).reshape(shape) for name in names})

@@ -1,7 +1,7 @@
-"""The test inside its program: lanes that take the next scenario as soon as theirs has ended.
+"""The compiled program of the test: a lane takes the next scenario when its episode ends.
 
-Every device has its own share of the scenarios in a queue; a lane whose episode ends
-takes the next, so that no lane waits for the longest episode of a batch.
+Every device has its own queue of scenarios, so that no lane waits for the longest episode
+of a batch.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
 from genidm.symmetry import horizontal_norm
 
-# Steps of an episode, which a trace holds, and of a program call, which holds what each leaves.
+# Bounds of the memory: steps of an episode (its trace), and of a program call (its outputs).
 MOST_STEPS = 10**5
 MOST_AT_ONCE = 10**4
 
-# (s [B, S], target − o [B, 3]) → a [B, A]; a tree of arrays, so that one compiled
-# program serves every controller of the same shape.
+# (s [B, S], relative goal [B, 3]) → a [B, A]. If it is a tree of arrays, one compiled program
+# serves every controller of the same shape.
 ControllerFn = Callable[[jax.Array, jax.Array], jax.Array]
-# State [B] → a tree of arrays [B, ...]: what is kept of each state of a traced episode.
+# State [B] → a tree of arrays [B, ...], which a trace keeps of each state.
 Record = Callable[[State], Any]
 
 
-# What jax raises where a function of the user's looks at numbers that are not there yet.
+# Errors of jax if a user's function reads the value of a traced array.
 _NOT_TRACEABLE = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -45,68 +45,70 @@ _NOT_TRACEABLE = (
 )
 
 
-def ask(who: str, asked: Callable[..., Any], shape: tuple[int, ...], *args: Any) -> jax.Array:
-    """What a function of the user's answers inside a program, if it is an array of this shape.
+def ask(name: str, function: Callable[..., Any], shape: tuple[int, ...], *args: Any) -> jax.Array:
+    """Call a user's function inside a compiled program, and check the array that it returns.
 
     Args:
-      who: what an error calls it.
-      asked: the function.
-      shape: that its answer must have; one that would only be broadcast is refused, too.
-      args: what it is asked with.
+      name: name of the function in error messages.
+      function: the user's function.
+      shape: exact shape that the result must have.
+      args: arguments of the function.
 
     Raises:
-      BadInput: the answer is something else, or cannot be computed inside a program.
+      BadInput: the result is not an array of numbers of this shape, or the function cannot
+        be traced.
     """
     try:
-        answer = asked(*args)
+        result = function(*args)
     except _NOT_TRACEABLE:
         raise BadInput(
-            f"{who} is asked inside a compiled program: it must compute with jax.numpy, and "
-            "choose with jnp.where"
+            f"{name} is called inside a compiled program: it must compute with jax.numpy, and "
+            "branch with jnp.where"
         ) from None
-    wanted = f"{who} must answer an array of numbers of shape {shape}, a row a robot"
-    if not isinstance(answer, jax.Array | np.ndarray):
-        raise BadInput(f"{wanted}, not {answer!r:.40}")
-    if answer.shape != shape or not (
-        jnp.issubdtype(answer.dtype, jnp.floating) or jnp.issubdtype(answer.dtype, jnp.integer)
+    wanted = f"{name} must return an array of numbers of shape {shape}, one row per robot"
+    if not isinstance(result, jax.Array | np.ndarray):
+        raise BadInput(f"{wanted}, not {result!r:.40}")
+    if result.shape != shape or not (
+        jnp.issubdtype(result.dtype, jnp.floating) or jnp.issubdtype(result.dtype, jnp.integer)
     ):
-        raise BadInput(f"{wanted}, not {answer.dtype}{list(answer.shape)}")
-    return jnp.asarray(answer)
+        raise BadInput(f"{wanted}, not {result.dtype}{list(result.shape)}")
+    return jnp.asarray(result)
 
 
 def as_tree(controller: ControllerFn) -> Any:
-    """A controller as a program takes it: a tree of arrays as it is, other functions as constants.
+    """Make a controller an argument of a program; one that is not a tree becomes a constant.
 
-    One compiled program serves every controller that is a tree, of the same shape.
+    One compiled program serves all controllers that are trees of the same shape.
     """
-    alone = jax.tree.leaves(controller) == [controller]
-    return jax.tree_util.Partial(controller) if alone else controller
+    is_leaf = jax.tree.leaves(controller) == [controller]
+    return jax.tree_util.Partial(controller) if is_leaf else controller
 
 
 def steered(robot: Robot, controller: ControllerFn, robots: State, target: jax.Array) -> jax.Array:
-    """Actions `[B, A]` for robots `[B]` on their way to `target [B, 3]`, metres.
+    """Compute the controller's actions `[B, A]` for robots `[B]` and `target [B, 3]`, metres.
 
     Raises:
-      BadInput: the controller answers something else.
+      BadInput: the controller does not return an array `[B, A]`.
     """
-    s, way = robots.observation, target - robots.position
-    return ask("the controller", controller, (len(s), robot.action.size), s, way).astype(s.dtype)
+    s, relative_goal = robots.observation, target - robots.position
+    shape = (len(s), robot.action.size)
+    return ask("the controller", controller, shape, s, relative_goal).astype(s.dtype)
 
 
 def position(state: State) -> jax.Array:
-    """Keeps o `[B, 3]`: an episode's way."""
+    """Keep o `[B, 3]`: the trace is the episode's trajectory."""
     return state.position
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings:
-    """Settings of the test.
+    """Settings of the test (A.1.3).
 
     Attributes:
-      max_steps: an episode ends after this many steps (A.1.3: 1000).
+      max_steps: maximum number of steps of an episode (A.1.3: 1000).
       goal_radius: metres; an episode ends when the target is this near.
-      num_envs: robots at once, over all devices; see `Robot.max_parallel_envs`.
-      chunk: steps a program call.
+      num_envs: robots to step at once, on all devices; see `Robot.max_parallel_envs`.
+      chunk: steps per program call.
     """
 
     max_steps: int = 1000
@@ -120,7 +122,7 @@ class EvaluationSettings:
 
 
 class EpisodeResults(flax.struct.PyTreeNode):
-    """What is known of each episode `[N]`, ended or not; see `Episodes`."""
+    """Results of each episode `[N]` so far; see `Episodes`."""
 
     closest: jax.Array
     start: jax.Array
@@ -136,10 +138,10 @@ class Running(flax.struct.PyTreeNode):
 
     Attributes:
       robots: State `[L]`.
-      target: `[L, 3]`.
-      episode: `[L]` int32, which of the device's n episodes the lane is at; n when it has none.
+      target: `[L, 3]`, metres.
+      episode: `[L]` int32, index of the lane's episode among the device's n; n if idle.
       now: EpisodeResults `[L]` of the running episodes.
-      taken: `[1]` int32, episodes handed out.
+      taken: `[1]` int32, number of episodes that lanes have taken.
     """
 
     robots: State
@@ -155,7 +157,7 @@ class EvaluationState(flax.struct.PyTreeNode):
     Attributes:
       running: the lanes.
       ended: EpisodeResults `[n]` of the episodes that have ended.
-      traces: tree `[m, max_steps + 1, ...]`, what is kept of the first m episodes.
+      traces: tree `[m, max_steps + 1, ...]`, traces of the first m episodes.
     """
 
     running: Running
@@ -167,7 +169,7 @@ class Share(NamedTuple):
     """The episodes of one device's queue.
 
     Attributes:
-      robots: State `[n]` at their starts.
+      robots: State `[n]` at the start of each.
       target: `[n, 3]`, metres.
     """
 
@@ -177,14 +179,14 @@ class Share(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """A test at work: scenarios shared out over the devices.
+    """Runs a test whose scenarios are divided among the devices.
 
     Attributes:
-      robot: what is steered.
+      robot: robot to control.
       scenarios: scenarios `[N]`.
-      settings: of the test.
-      mesh: devices that the lanes and scenarios are shared among.
-      traced: how many of the first episodes leave a trace in the queue.
+      settings: settings of the test.
+      mesh: devices that share the lanes and scenarios.
+      traced: number of the first episodes to trace.
       record: what a trace keeps of each state.
     """
 
@@ -197,16 +199,16 @@ class Evaluator:
 
     @property
     def total(self) -> int:
-        """Scenarios in all, N."""
+        """N, number of scenarios."""
         return self.scenarios.yaw.shape[0]
 
     @property
     def share(self) -> int:
-        """Scenarios of a device, n; the last of them is repeated to fill them up to n a device."""
+        """n, scenarios per device; the last scenario is repeated where a share is not full."""
         return -(-self.total // self.mesh.size)
 
     def start(self) -> EvaluationState:
-        """Queues whose lanes are all idle, on the devices."""
+        """Make the state before the first step, on the devices: all lanes are idle."""
         count, share = self.mesh.size, self.share
         lanes = count * min(
             -(-self.robot.max_parallel_envs(self.settings.num_envs) // count), share
@@ -217,16 +219,16 @@ class Evaluator:
             ),
             target=jnp.zeros((lanes, 3), jnp.float32),
             episode=jnp.full(lanes, share, jnp.int32),
-            now=_nothing(lanes),
+            now=_no_results(lanes),
             taken=jnp.zeros(count, jnp.int32),
         )
-        queue = EvaluationState(running, _nothing(share * count), self._no_traces())
-        return devices.put(queue, self.mesh)
+        state = EvaluationState(running, _no_results(share * count), self._no_traces())
+        return devices.put(state, self.mesh)
 
     def _no_traces(self) -> Any:
-        """Traces that hold the starts alone."""
+        """Traces that hold the starts only."""
         count, share, steps = self.mesh.size, self.share, self.settings.max_steps
-        # One a device at least: jax forgets how an array without elements is shared out.
+        # At least one per device: jax loses the sharding of an array without elements.
         each = max(1, -(-self.traced // count))
 
         def first(x: jax.Array) -> jax.Array:
@@ -237,47 +239,47 @@ class Evaluator:
         return jax.tree.map(first, self.record(jax.tree.map(np.asarray, self._shares.robots)))
 
     def prepare(
-        self, controller: ControllerFn, queue: EvaluationState
+        self, controller: ControllerFn, state: EvaluationState
     ) -> Callable[[EvaluationState], EvaluationState]:
-        """The compiled program of `settings.chunk` steps of every lane; it donates the queue."""
+        """Compile `settings.chunk` steps of every lane; the function donates its argument."""
         controller = devices.put(as_tree(controller), self.mesh, None)
         shares = self._shares
         body = functools.partial(_chunk, self.robot, self.settings, self.record)
         sharded = devices.over_lanes(body, self.mesh, [None, 0, 0], 0)
         jitted = jax.jit(sharded, donate_argnums=1)
-        program = compile_ahead("evaluation", jitted, controller, queue, shares)
-        return lambda queue: program(controller, queue, shares)
+        program = compile_ahead("evaluation", jitted, controller, state, shares)
+        return lambda state: program(controller, state, shares)
 
-    def ended(self, queue: EvaluationState) -> int:
-        """Episodes that have ended, those that fill up a share not counted."""
-        return int((self._in_order(queue.ended.steps)[: self.total] > 0).sum())
+    def ended(self, state: EvaluationState) -> int:
+        """Number of episodes that have ended, without those that fill a share."""
+        return int((self._in_order(state.ended.steps)[: self.total] > 0).sum())
 
-    def useful(self, queue: EvaluationState, calls: int) -> float:
-        """Share of the lane-steps of so many calls that were spent in episodes."""
-        steps = np.asarray(queue.ended.steps).sum() + self._under_way(queue).sum()
-        return float(steps / (calls * self.settings.chunk * queue.running.episode.shape[0]))
+    def useful(self, state: EvaluationState, calls: int) -> float:
+        """Fraction of the lane-steps of `calls` calls in which a lane had an episode."""
+        steps = np.asarray(state.ended.steps).sum() + self._under_way(state).sum()
+        return float(steps / (calls * self.settings.chunk * state.running.episode.shape[0]))
 
-    def longest(self, queue: EvaluationState) -> int:
-        """Steps of the longest episode under way; until it ends there may be none to count."""
-        return int(self._under_way(queue).max())
+    def longest(self, state: EvaluationState) -> int:
+        """Steps so far of the longest running episode: progress before any episode ends."""
+        return int(self._under_way(state).max())
 
-    def _under_way(self, queue: EvaluationState) -> np.ndarray:
-        """Steps `[lanes]` of the episode that each lane is at; 0 for one that has none."""
-        return np.where(np.asarray(queue.running.episode) < self.share, queue.running.now.steps, 0)
+    def _under_way(self, state: EvaluationState) -> np.ndarray:
+        """Steps `[lanes]` so far of each lane's episode; 0 for an idle lane."""
+        return np.where(np.asarray(state.running.episode) < self.share, state.running.now.steps, 0)
 
-    def results(self, queue: EvaluationState) -> EpisodeResults:
-        """Outcomes `[N]`, in the order of the scenarios."""
-        return jax.tree.map(lambda x: self._in_order(x)[: self.total], queue.ended)
+    def results(self, state: EvaluationState) -> EpisodeResults:
+        """Results `[N]`, in the order of the scenarios."""
+        return jax.tree.map(lambda x: self._in_order(x)[: self.total], state.ended)
 
-    def traces(self, queue: EvaluationState) -> list[Any]:
-        """What was kept of each traced episode, tree `[steps + 1, ...]`."""
-        steps = self._in_order(queue.ended.steps)
-        kept = jax.tree.map(self._in_order, queue.traces)
+    def traces(self, state: EvaluationState) -> list[Any]:
+        """Trace of each traced episode, a tree `[steps + 1, ...]`."""
+        steps = self._in_order(state.ended.steps)
+        kept = jax.tree.map(self._in_order, state.traces)
         return [jax.tree.map(lambda x, i=i: x[i, : steps[i] + 1], kept) for i in range(self.traced)]
 
     @functools.cached_property
     def _shares(self) -> Share:
-        """Episodes `[devices × n]`, dealt out to the devices in turn, short shares filled up."""
+        """Episodes `[devices × n]`; device i of D has the scenarios i, i + D, i + 2 D and so on."""
         count, share = self.mesh.size, self.share
         dealt = np.minimum(np.arange(share * count), self.total - 1)
         dealt = dealt.reshape(share, count).T.reshape(-1)
@@ -286,29 +288,29 @@ class Evaluator:
         return Share(start(scenarios.keys, scenarios.yaw), scenarios.target)
 
     def _in_order(self, x: jax.Array) -> np.ndarray:
-        """Undoes the dealing out: `[devices × n, ...]` in the order of the scenarios."""
+        """Bring `[devices × n, ...]` back into the order of the scenarios."""
         dealt = np.asarray(x)
         rows = dealt.reshape(self.mesh.size, -1, *dealt.shape[1:])
         return rows.swapaxes(0, 1).reshape(dealt.shape)
 
 
-def _nothing(count: int) -> EpisodeResults:
+def _no_results(count: int) -> EpisodeResults:
     def zeros(kind: Any = jnp.float32) -> jax.Array:
-        return jnp.zeros(count, kind)  # an array of its own, as it is donated
+        return jnp.zeros(count, kind)  # one array per field, because all are donated
 
     return EpisodeResults(
         zeros(), zeros(), zeros(bool), zeros(bool), zeros(bool), zeros(jnp.int32), zeros()
     )
 
 
-class _Seen(NamedTuple):
-    """What a step of L lanes leaves to be written down.
+class _Outputs(NamedTuple):
+    """Outputs of one step of L lanes.
 
     Attributes:
-      episode: `[L]`, which of the n episodes the lane was at; n if at none.
-      over: `[L]` bool, it has ended.
-      now: its EpisodeResults `[L]` so far.
-      kept: what a trace keeps `[L, ...]` of the state after the step.
+      episode: `[L]`, index of the lane's episode among the n; n if idle.
+      over: `[L]` bool, the episode has ended.
+      now: EpisodeResults `[L]` so far.
+      kept: `[L, ...]`, what a trace keeps of the state after the step.
     """
 
     episode: jax.Array
@@ -322,30 +324,30 @@ def _chunk(
     settings: EvaluationSettings,
     keep: Record,
     controller: ControllerFn,
-    queue: EvaluationState,
+    state: EvaluationState,
     shares: Share,
 ) -> EvaluationState:
-    """`settings.chunk` steps of one device's lanes, then what they leave is written down."""
+    """Step one device's lanes `settings.chunk` times, then store their results and traces."""
 
     def act(lanes: Running, _: None) -> tuple[State, jax.Array, Running]:
-        lanes = _take(lanes, shares)
+        lanes = _take_next(lanes, shares)
         return lanes.robots, steered(robot, controller, lanes.robots, lanes.target), lanes
 
-    def watch(_: Running, move: Move) -> tuple[Running, _Seen]:
+    def watch(_: Running, move: Move) -> tuple[Running, _Outputs]:
         lanes: Running = move.notes
-        now = _observe(lanes.now, move, lanes.target, settings.goal_radius)
+        now = _update(lanes.now, move, lanes.target, settings.goal_radius)
         over = now.reached | now.fell | now.diverged | (now.steps >= settings.max_steps)
         over &= lanes.episode < len(shares.target)
-        seen = _Seen(lanes.episode, over, now, keep(move.after))
+        seen = _Outputs(lanes.episode, over, now, keep(move.after))
         idle = jnp.where(over, len(shares.target), lanes.episode)
         return lanes.replace(robots=move.after, episode=idle, now=now), seen
 
-    running, seen = rollout(robot, act, watch, queue.running, steps=settings.chunk)
-    return _written(queue.replace(running=running), seen)
+    running, seen = rollout(robot, act, watch, state.running, steps=settings.chunk)
+    return _store(state.replace(running=running), seen)
 
 
-def _take(lanes: Running, shares: Share) -> Running:
-    """Idle lanes take the next episodes of the queue, while there are any."""
+def _take_next(lanes: Running, shares: Share) -> Running:
+    """Give the next episodes of the queue, if any are left, to the idle lanes."""
     total = len(shares.target)
     idle = lanes.episode >= total
     rank = lanes.taken + jnp.cumsum(idle, dtype=jnp.int32) - 1
@@ -353,7 +355,7 @@ def _take(lanes: Running, shares: Share) -> Running:
     episode = jnp.where(takes, rank, lanes.episode).astype(jnp.int32)
     new = jax.tree.map(lambda x: x[jnp.minimum(episode, total - 1)], shares)
     distance = horizontal_norm(new.target - new.robots.position).astype(jnp.float32)
-    fresh = _nothing(episode.shape[0]).replace(closest=distance, start=distance)
+    fresh = _no_results(episode.shape[0]).replace(closest=distance, start=distance)
     return Running(
         robots=select(takes, new.robots, lanes.robots),
         target=select(takes, new.target, lanes.target),
@@ -363,10 +365,10 @@ def _take(lanes: Running, shares: Share) -> Running:
     )
 
 
-def _observe(
+def _update(
     now: EpisodeResults, move: Move, target: jax.Array, goal_radius: float
 ) -> EpisodeResults:
-    """The outcomes so far, with one more step in them."""
+    """Update the results with one step."""
     o, o_next = move.before.position, move.after.position
     distance = horizontal_norm(target - o_next).astype(jnp.float32)
     return EpisodeResults(
@@ -380,17 +382,17 @@ def _observe(
     )
 
 
-def _written(queue: EvaluationState, seen: _Seen) -> EvaluationState:
-    """The queue with what some steps `[T, L]` have left: results and traces."""
-    slot = jnp.where(seen.over, seen.episode, len(queue.ended.steps))
+def _store(state: EvaluationState, seen: _Outputs) -> EvaluationState:
+    """Store the results and traces of steps `[T, L]`."""
+    slot = jnp.where(seen.over, seen.episode, len(state.ended.steps))
 
     def keep(kept: jax.Array, x: jax.Array) -> jax.Array:
         return kept.at[slot].set(x, mode="drop")
 
-    def follow(trace: jax.Array, x: jax.Array) -> jax.Array:
+    def extend(trace: jax.Array, x: jax.Array) -> jax.Array:
         return trace.at[seen.episode, seen.now.steps].set(x, mode="drop")
 
-    return queue.replace(
-        ended=jax.tree.map(keep, queue.ended, seen.now),
-        traces=jax.tree.map(follow, queue.traces, seen.kept),
+    return state.replace(
+        ended=jax.tree.map(keep, state.ended, seen.now),
+        traces=jax.tree.map(extend, state.traces, seen.kept),
     )

@@ -1,4 +1,4 @@
-"""Whether a controller moves at all, and whether it heeds its goal: said, as no mean tells it."""
+"""Warnings about controllers that hardly move or ignore their goal; no mean distance shows it."""
 
 from __future__ import annotations
 
@@ -9,72 +9,72 @@ import numpy as np
 
 from genidm.evaluation.episodes import Episodes
 
-# Way walked over distance to the target, means: below it a robot hardly moves. In the Ant's test
-# it is 1.6 to 5 for fitted controllers, 0.8 where actions at random were learned from.
+# Mean path length divided by mean distance to the target; below this, a robot hardly moves. In the
+# Ant's test the ratio is 1.6 to 5 for fitted controllers, and 0.8 for RS.
 STILL = 0.5
-# `heeds` below which a controller hardly does. On the Ant HF, GE and LR have 0.14 to 0.3, and RL
-# and RS, which do not go where they are told, 0.03 to 0.07.
+# Value of `heeds` below which a controller ignores its goal. On the Ant, HF, GE and LR have 0.14
+# to 0.3; RL and RS, which do not walk to their goals, have 0.03 to 0.07.
 HEEDLESS = 0.1
 
 
 def walked(name: str, episodes: Episodes) -> dict[str, float]:
-    """Way walked over distance to the target, means of all episodes; a warning where it is short.
+    """Compute mean path length / mean distance to the target; warn if the robot hardly moves.
 
     Args:
-      name: what a warning calls the controller.
-      episodes: its test.
+      name: name of the controller in the warning.
+      episodes: results of its test; diverged episodes are left out.
 
     Returns:
-      "walked": 1 for a robot that goes straight to its target.
+      "walked": the ratio; 1 for a robot that walks straight to its target.
     """
     finite = ~np.asarray(episodes.diverged)
     if not finite.any():
         return {"walked": 0.0}
-    way, start = (float(x[finite].mean()) for x in (episodes.path_length, episodes.start))
-    if way < STILL * start:
+    path, start = (float(x[finite].mean()) for x in (episodes.path_length, episodes.start))
+    if path < STILL * start:
         print(
-            f"warning: {name} hardly moves: it walks {way:.2g} m, where targets are {start:.2g} m "
-            "away",
+            f"warning: {name} hardly moves: it walks {path:.2g} m, but its targets are "
+            f"{start:.2g} m away",
             file=sys.stderr,
         )
-    return {"walked": way / start}
+    return {"walked": path / start}
 
 
 def heeds(name: str, ways: Sequence[np.ndarray], target: np.ndarray) -> dict[str, float]:
-    """How much better the ways of the tours (Fig. 8) fit their own targets than those of others.
+    """Measure how much the direction of a trajectory (Fig. 8) depends on the target.
 
-    The tours of a row start alike, and their targets alone differ: who does not heed the goal goes
-    the same way in all of them. A warning where the ways hardly tell the targets apart.
+    The episodes of a row have the same start and different targets, so a controller that
+    ignores its goal walks in the same direction in all of them. Warn if the value is low.
 
-    Not taken: the loss of a fit with d shuffled. A record of walking has d nearly alike throughout,
-    so that it hardly rises: on the Ant by 0 to 3 % for HF, and by 49 % for RS, which knows its few
-    samples by heart.
+    The increase of a fit's loss with shuffled d is not a good measure: d is nearly constant in a
+    record of walking. On the Ant, it is 0 to 3 % for HF, and 49 % for RS, which overfits its few
+    samples.
 
     Args:
-      name: what a warning calls the controller.
-      ways: positions `[steps + 1, 3]` of every tour, row by row, metres.
-      target: `[rows, tours, 3]`, metres.
+      name: name of the controller in the warning.
+      ways: positions `[steps + 1, 3]` of every episode, row by row, metres.
+      target: `[rows, episodes, 3]`, metres.
 
     Returns:
-      "heeds": the mean cosine between the way gone and the way to its own target, less that to the
-      targets of the others; 0 for a controller that ignores where it is to go.
+      "heeds": mean cosine between the direction walked and the direction to the episode's own
+      target, minus that to the other targets; 0 for a controller that ignores its goal.
     """
-    rows, tours = target.shape[:2]
+    rows, episodes = target.shape[:2]
     start, end = (np.stack([way[i] for way in ways]).reshape(target.shape) for i in (0, -1))
-    gone, there = (_level(x - start) for x in (end, target))
-    cosine = np.einsum("rix,rjx->rij", gone, there)
+    actual, wanted = (_horizontal(x - start) for x in (end, target))
+    cosine = np.einsum("rix,rjx->rij", actual, wanted)
     own = np.trace(cosine, axis1=1, axis2=2)
-    others = (cosine.sum((1, 2)) - own) / (tours - 1)
-    more = float((own - others).sum() / (rows * tours))
-    if more < HEEDLESS:
+    others = (cosine.sum((1, 2)) - own) / (episodes - 1)
+    difference = float((own - others).sum() / (rows * episodes))
+    if difference < HEEDLESS:
         print(
-            f"warning: {name} hardly heeds where it is to go: on its way to other targets it goes "
-            "much the same way",
+            f"warning: {name} hardly reacts to its goal: it walks in nearly the same direction "
+            "to all targets",
             file=sys.stderr,
         )
-    return {"heeds": more}
+    return {"heeds": difference}
 
 
-def _level(x: np.ndarray) -> np.ndarray:
-    """Horizontal unit vectors `[..., 2]`; zero where there is no length."""
+def _horizontal(x: np.ndarray) -> np.ndarray:
+    """Horizontal unit vectors `[..., 2]`; zero where the length is zero."""
     return x[..., :2] / np.maximum(np.linalg.norm(x[..., :2], axis=-1, keepdims=True), 1e-6)

@@ -1,4 +1,4 @@
-"""Scenarios: the paper's test (A.1.3), fixed once and shared by every method."""
+"""Scenarios of the paper's test (A.1.3), the same for every method."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from genidm.tasks import ahead
 
 
 class Scenarios(flax.struct.PyTreeNode):
-    """Test episodes `[seeds, episodes]`: where each starts, and where it should go.
+    """Starts and targets of test episodes `[seeds, episodes]`.
 
     Attributes:
       keys: random keys `[seeds, episodes]` of the starts.
-      yaw: `[seeds, episodes]`, radians, that the start is turned by.
+      yaw: `[seeds, episodes]`, rotations of the starts, radians.
       target: `[seeds, episodes, 3]`, metres, world frame.
     """
 
@@ -34,35 +34,36 @@ class Scenarios(flax.struct.PyTreeNode):
         return self.yaw.shape
 
     def digest(self) -> str:
-        """sha256 over all numbers: equal digests mean equal tests."""
+        """sha256 of all numbers: tests with equal digests are equal."""
         h = hashlib.sha256()
         for x in (jax.random.key_data(self.keys), self.yaw, self.target):
             h.update(np.ascontiguousarray(x).tobytes())
         return h.hexdigest()
 
 
-# So that the scenarios of seed n are not the random numbers of a collecting seed n.
+# Test seed n and training seed n must not give the same random numbers.
 SCENARIO_KEY = 0x7E57
-# Their starts lie in memory at once: a hundred times the paper's take a gigabyte for the Ant.
+# All starts are in memory at once: 1 GB for this many of the Ant, 100 times the paper's test.
 MOST_EPISODES = 10**6
 
 
 def scenarios(
     robot: Robot, seeds: int = 10, episodes: int = 1000, first_seed: int = 0
 ) -> Scenarios:
-    """The paper's test: random heading, target 2–5 m away within ±45° of the heading.
+    """Make the paper's test (A.1.3): random heading, target 2–5 m away within ±45° of it.
 
-    A function of the robot and the seeds alone; more episodes extend the same list.
-    The target's height is that of a standing robot, so d is three-dimensional.
+    The result depends on the robot and the seeds only; more episodes extend the same list.
+    The target has the height of a standing robot, so d is three-dimensional.
 
     Args:
-      robot: sets the target's distance and height.
+      robot: its test gives the target's distance (Minitaur: 1.5–2.5 m) and height.
       seeds: number of test seeds.
-      episodes: episodes a seed.
-      first_seed: the first of them.
+      episodes: episodes per seed.
+      first_seed: first test seed.
 
     Raises:
-      BadInput: there are none, or more than `MOST_EPISODES` in all, or a seed has no 32 bits.
+      BadInput: there is no episode, or there are more than `MOST_EPISODES`, or a seed is not
+        of 32 bits.
     """
     check_value("seeds of a test", seeds, count())
     check_value("episodes of a test", episodes, count())
@@ -93,12 +94,12 @@ def _scenarios(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenari
 def toward(
     robot: Robot, keys: jax.Array, yaw: jax.Array, distance: jax.Array, bearing: jax.Array
 ) -> Scenarios:
-    """Scenarios with targets at given distances and bearings.
+    """Make scenarios with targets at given distances and bearings.
 
     Args:
-      robot: whose starts they are.
-      keys: `[seeds, episodes]`.
-      yaw: `[seeds, episodes]`, radians, that the start is turned by.
+      robot: robot of the scenarios.
+      keys: random keys `[seeds, episodes]` of the starts.
+      yaw: `[seeds, episodes]`, rotations of the starts, radians.
       distance: `[seeds, episodes]`, metres from the start.
       bearing: `[seeds, episodes]`, radians to the left of the start's heading.
     """
@@ -107,16 +108,17 @@ def toward(
     return Scenarios(keys, yaw, target.reshape(*yaw.shape, 3).astype(jnp.float32))
 
 
-# Fig. 8: ten episodes where the robot starts as it did while it learned, and ten where it
-# faces almost the other way.
+# Fig. 8: ten episodes start as in training; in ten others, the robot faces almost the opposite
+# direction.
 FIG8_EPISODES = 10
 UNSEEN_YAW = 0.75 * np.pi
 
 
 def fig8_scenarios(robot: Robot) -> Scenarios:
-    """The scenarios of Fig. 8, `[2, 10]`: one fixed start each, targets 3–5 m ahead.
+    """Make the scenarios of Fig. 8, `[2, 10]`: one fixed start per row, targets far ahead.
 
-    Row 0 starts at yaw 0, as all experience did; row 1 turned by 135°.
+    Row 0 starts at yaw 0, as in training; row 1 at 135°. Targets lie in the farther half of
+    the test's range (Ant: 3.5–5 m).
     """
     low, high = robot.target_distance
     far = jnp.linspace((low + high) / 2, high, FIG8_EPISODES, dtype=jnp.float32)

@@ -1,10 +1,10 @@
-"""Numbers from episodes: means, intervals, and comparisons on the same scenarios.
+"""Statistics of episodes: means, intervals, and comparisons on the same scenarios (Table 1).
 
-An interval of one controller's test is a percentile bootstrap over *test seeds*: a seed's
-episodes are averaged first, because they share a random key, and the seeds' means are
-resampled. It tells how well the test measured this one trained controller. How much another
-training seed would move the number is in `spread` and `paired_spread`, and it is usually more:
-there a training seed's episodes are averaged first, and the training seeds are resampled.
+The interval of a single controller is a percentile bootstrap over *test seeds*: it averages
+the episodes of each seed, because they share a random key, and resamples these means. It
+shows how precisely the test measures this controller. `spread` and `paired_spread` show how
+much the training seed changes the result, usually more: they average the episodes of each
+training seed, and resample the training seeds.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from genidm.evaluation.episodes import Episodes
 
 Array = np.ndarray
 
-THRESHOLDS = (0.25, 0.5, 1.0)  # metres; an episode that came this near is a success
+THRESHOLDS = (0.25, 0.5, 1.0)  # metres; an episode that comes this near is a success
 RESAMPLES = 10_000  # of each bootstrap
-_BATCH = 1_000  # resamples drawn at once, which bounds the memory
-_SEED = 0  # of the bootstrap's generator: the same episodes give the same interval
-_FEWEST = 3  # training seeds that an interval is made from
+_BATCH = 1_000  # resamples drawn at once, to limit the memory
+_SEED = 0  # fixed, so that the same episodes give the same interval
+_FEWEST = 3  # training seeds that an interval needs
 
 
 def summary(episodes: Episodes) -> dict[str, Any]:
-    """One method's row of Table 1, from its episodes `[seeds, episodes]`.
+    """Compute a method's row of Table 1 from its episodes `[seeds, episodes]`.
 
-    Diverged episodes are left out of every mean (mean, std, ci95, iqm, steps), as their numbers
-    mean nothing. The shares (success, fell, reached, diverged) are of all episodes, and a
-    diverged episode is no success, so that breaking the physics never pays.
+    Means (mean, std, ci95, iqm, steps) leave out diverged episodes, whose numbers have no
+    meaning. Fractions (success, fell, reached, diverged) count all episodes; a diverged
+    episode is not a success, so a controller gains nothing by breaking the physics.
 
     Returns:
       mean, std: metres; closest distance over all episodes, the two columns of Table 1.
       ci95: metres; 95 % bootstrap interval of the mean (see `interval`).
       iqm: metres; interquartile mean over episodes.
-      success: share of episodes within "0.25", "0.5" and "1.0" metres of the target.
-      fell, reached, diverged: shares of episodes.
-      steps: mean control steps of an episode.
-      seeds, episodes: how many test seeds, and episodes of each.
+      success: fraction of episodes within "0.25", "0.5" and "1.0" metres of the target.
+      fell, reached, diverged: fractions of episodes.
+      steps: mean number of environment steps per episode.
+      seeds, episodes: number of test seeds, and of episodes per seed.
 
-      A mean is NaN where every episode diverged.
+      A mean is NaN if every episode diverged.
 
     Raises:
-      ValueError: closest is not `[seeds, episodes]`, holds none, or is not finite in an
+      ValueError: closest is not `[seeds, episodes]`, is empty, or is not finite in an
         episode that did not diverge.
     """
     closest, lost = masked(episodes), np.asarray(episodes.diverged, bool)
@@ -64,17 +64,17 @@ def summary(episodes: Episodes) -> dict[str, Any]:
 
 
 def paired(a: Episodes, b: Episodes) -> dict[str, Any]:
-    """Method a against method b on identical scenarios, both `[seeds, episodes]`.
+    """Compare method a with method b on the same scenarios, both `[seeds, episodes]`.
 
-    Scenarios in which either diverged are left out.
+    Scenarios in which a or b diverged are left out.
 
     Returns:
-      difference: metres; mean of a's closest distance minus b's, negative where a is better.
+      difference: metres; mean closest distance of a minus that of b, negative if a is better.
       ci95: metres; 95 % bootstrap interval of the difference (see `interval`).
-      improvement: probability that a comes nearer than b in a scenario; equals count half.
+      improvement: probability that a comes nearer than b in a scenario; ties count half.
 
     Raises:
-      ValueError: the two were not run on the same scenarios.
+      ValueError: a and b are not on the same scenarios.
     """
     _check_same_scenarios(a, b)
     difference = masked(a) - masked(b)
@@ -86,18 +86,18 @@ def paired(a: Episodes, b: Episodes) -> dict[str, Any]:
 
 
 def improvement(difference: Array) -> float:
-    """Probability that the first of two is nearer, from differences of their distances.
+    """Probability that a is nearer than b, from differences of distances a − b.
 
-    The share of differences below 0, where 0 itself counts half and NaN is left out.
+    The fraction of differences below 0; 0 counts half, and NaN is left out.
     """
     kept = difference[np.isfinite(difference)]
     return _mean((kept < 0) + 0.5 * (kept == 0))
 
 
 def common(a: Episodes, b: Episodes) -> tuple[Episodes, Episodes]:
-    """The part of two tests that both made, where one stopped earlier in the same scenarios.
+    """Cut two tests of different size to the scenarios that both have.
 
-    Scenarios with fewer seeds or episodes are the beginning of one with more.
+    Scenarios with fewer seeds or episodes are the start of those with more.
     """
     seeds, episodes = map(min, zip(a.closest.shape, b.closest.shape, strict=True))
 
@@ -109,28 +109,29 @@ def common(a: Episodes, b: Episodes) -> tuple[Episodes, Episodes]:
 
 
 def spread(runs: Sequence[Episodes]) -> dict[str, Any]:
-    """One method over several training seeds, the episodes of each run `[seeds, episodes]`.
+    """Statistics of a method over training seeds; each run has episodes `[seeds, episodes]`.
 
     Returns:
-      means: metres; each run's mean closest distance, in the order given.
-      mean, std: metres; mean and sample standard deviation (n − 1) of these; NaN std of one.
-      ci95: metres; 95 % bootstrap interval of the mean over training seeds; NaN of fewer
-        than 3. Of 3 it is the least and the greatest, and covers the truth 3 times in 4.
+      means: metres; mean closest distance of each run, in the given order.
+      mean, std: metres; mean and sample standard deviation (n − 1) of these; std of one is NaN.
+      ci95: metres; 95 % bootstrap interval of the mean over training seeds; NaN for fewer than
+        3. For 3 it is the smallest and the largest, which contain the true mean in 3 of 4 cases.
     """
     return _spread([_mean(masked(run)) for run in runs])
 
 
 def paired_spread(a: Sequence[Episodes], b: Sequence[Episodes]) -> dict[str, Any]:
-    """`spread` of the paired difference a − b, run i of both with one training seed.
+    """`spread` of the paired difference a − b; run i of a and of b have the same training seed.
 
-    Each pair of runs is compared on the scenarios that both saw.
+    Each pair of runs is compared on the scenarios that both have.
 
     Returns:
-      what `spread` does, of the differences, and improvement: the share of training seeds
-      with which a comes nearer in the mean; equals count half.
+      `spread` of the differences, and improvement: the fraction of training seeds for which
+      a has the smaller mean; ties count half.
 
     Raises:
-      ValueError: not as many runs of both, or two runs were not on the same scenarios.
+      ValueError: a and b have different numbers of runs, or a pair is not on the same
+        scenarios.
     """
     pairs = [paired(*common(x, y)) for x, y in zip(a, b, strict=True)]
     differences = [pair["difference"] for pair in pairs]
@@ -140,14 +141,14 @@ def paired_spread(a: Sequence[Episodes], b: Sequence[Episodes]) -> dict[str, Any
 def interval(values: Array) -> tuple[float, float]:
     """95 % percentile bootstrap interval of the mean of `values [seeds, episodes]`.
 
-    Resamples the seeds' means. Where only one seed has values, its episodes are resampled
-    instead: such an interval takes them as independent and is too narrow if they are not.
-    NaN values are left out; the interval is NaN where nothing is left.
+    Resamples the means of the seeds. If only one seed has values, it resamples its episodes:
+    this interval assumes that they are independent, and is too narrow if they are not.
+    NaN values are left out; without other values the interval is NaN.
     """
     rows = [row[np.isfinite(row)] for row in np.asarray(values, float)]
     rows = [row for row in rows if row.size]
     units = np.array([row.mean() for row in rows]) if len(rows) != 1 else rows[0]
-    if units.size < 2:  # SciPy refuses to resample one number, or none
+    if units.size < 2:  # SciPy cannot resample fewer than two numbers
         return _mean(units), _mean(units)
     low, high = scipy.stats.bootstrap(
         (units,), np.mean, n_resamples=RESAMPLES, batch=_BATCH, confidence_level=0.95,
@@ -157,7 +158,7 @@ def interval(values: Array) -> tuple[float, float]:
 
 
 def interquartile_mean(values: Array) -> float:
-    """Mean of the middle half of `values`, NaN left out: the least and greatest quarter go."""
+    """Mean of the middle half of `values`, without NaN and the lowest and highest quarter."""
     kept = values[np.isfinite(values)]
     return float(scipy.stats.trim_mean(kept, 0.25)) if kept.size else float("nan")
 
@@ -166,7 +167,7 @@ def masked(episodes: Episodes) -> Array:
     """Closest distance `[seeds, episodes]` in metres, NaN where the episode diverged.
 
     Raises:
-      ValueError: closest is not `[seeds, episodes]`, holds none, or is not finite in an
+      ValueError: closest is not `[seeds, episodes]`, is empty, or is not finite in an
         episode that did not diverge.
     """
     closest = np.asarray(episodes.closest, float)
@@ -192,8 +193,8 @@ def _check_same_scenarios(a: Episodes, b: Episodes) -> None:
     if a.closest.shape != b.closest.shape:
         raise ValueError(f"not the same scenarios: {a.closest.shape} and {b.closest.shape}")
     both = ~(np.asarray(a.diverged, bool) | np.asarray(b.diverged, bool))
-    # A millimetre: far above what another program order does to a float32 start, far below
-    # what another scenario does.
+    # 1 mm is far more than float32 rounding in another program, and far less than the difference
+    # between two scenarios.
     if not np.allclose(a.start[both], b.start[both], rtol=0, atol=1e-3):
         raise ValueError("not the same scenarios: the distances at the start differ")
 

@@ -1,4 +1,4 @@
-"""Through waypoints (§5.3, Fig. 7): a planner says where to go, the controller goes there."""
+"""Waypoints (§5.3, Fig. 7): a planner gives the next target, and the controller walks to it."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
 from genidm.symmetry import horizontal_norm, wrap
 
-# (o [B, 3], waypoints [B, W, 3], which of them are left [B, W] bool) → where to go now [B, 3],
-# metres, world frame; asked anew at each step.
+# (o [B, 3], waypoints [B, W, 3], unreached [B, W] bool) → target [B, 3], metres, world frame;
+# called at each step.
 Planner = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 
 
-def first_unreached(o: jax.Array, waypoints: jax.Array, left: jax.Array) -> jax.Array:
-    """Straight to the first waypoint that is left; to the last one when none is."""
-    first = jnp.where(left.any(-1), jnp.argmax(left, axis=-1), waypoints.shape[1] - 1)
+def first_unreached(o: jax.Array, waypoints: jax.Array, unreached: jax.Array) -> jax.Array:
+    """Plan straight to the first unreached waypoint; to the last if all are reached."""
+    first = jnp.where(unreached.any(-1), jnp.argmax(unreached, axis=-1), waypoints.shape[1] - 1)
     return jnp.take_along_axis(waypoints, first[:, None, None], axis=1)[:, 0]
 
 
-# State [B] → a tree of arrays [B, ...]: what is kept of every state on the way.
+# State [B] → a tree of arrays [B, ...], which is kept of every state.
 Record = Callable[[State], Any]
 
 
 def nothing(_: State) -> tuple[()]:
-    """Keeps positions and headings alone."""
+    """Keep positions and headings only."""
     return ()
 
 
 @dataclasses.dataclass(frozen=True)
 class WaypointSettings:
-    """Settings of a journey.
+    """Settings of a run through waypoints.
 
     Attributes:
-      max_steps: it ends after this many steps.
-      goal_radius: metres, horizontal; a waypoint is reached when it is this near and its turn.
-      chunk: steps a program call.
+      max_steps: maximum number of steps.
+      goal_radius: metres, horizontal; at this distance, the first unreached waypoint is reached.
+      chunk: steps per program call.
     """
 
     max_steps: int = 2000
@@ -63,17 +63,17 @@ class WaypointSettings:
 
 @dataclasses.dataclass(frozen=True)
 class WaypointRuns:
-    """B journeys through W waypoints, over T steps at most.
+    """B runs through W waypoints, with T steps in the longest.
 
     Attributes:
       waypoints: `[B, W, 3]`, metres.
-      position: `[B, T + 1, 3]`, metres; of a journey that is over, where it ended.
+      position: `[B, T + 1, 3]`, metres; constant after the end of a run.
       heading: `[B, T + 1]`, radians.
-      steps: `[B]`, that were made.
-      arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
-      fell: `[B]` bool; ended by a fall, or by physics that diverged.
-      dt: seconds.
-      recorded: tree of arrays `[B, T + 1, ...]`, that was asked for beside.
+      steps: `[B]`, number of steps.
+      arrival: `[B, W]`, step at which a waypoint was reached; −1 if it was not.
+      fell: `[B]` bool; a fall or diverged physics ended the run.
+      dt: seconds per step.
+      recorded: tree of arrays `[B, T + 1, ...]`, what `record` kept.
     """
 
     waypoints: np.ndarray
@@ -87,31 +87,31 @@ class WaypointRuns:
 
     @property
     def made(self) -> np.ndarray:
-        """`[B, T + 1]` bool, whether the journey was still going on."""
+        """`[B, T + 1]` bool, False after the end of a run."""
         return np.arange(self.position.shape[1]) <= self.steps[:, None]
 
     @property
     def times(self) -> np.ndarray:
-        """Seconds to each waypoint `[B, W]`; NaN where it was not reached."""
+        """Seconds to each waypoint `[B, W]`; NaN if it was not reached."""
         return np.where(self.arrival < 0, np.nan, self.arrival * self.dt)
 
     @property
     def cross_track_error(self) -> np.ndarray:
-        """Metres `[B, T + 1]` from the leg that the robot was on; NaN after the end.
+        """Distance `[B, T + 1]` from the current leg, metres; NaN after the end.
 
-        A leg is the straight line from the last waypoint, at first the start, to the next.
+        A leg is the straight line from the last waypoint (at first the start) to the next.
         """
         corners = self._corners()
         begin, end = (np.take_along_axis(corners, self._leg(k), axis=1) for k in (0, 1))
-        way, along = self.position[..., :2] - begin, end - begin
-        length = np.maximum((along**2).sum(-1), 1e-12)
-        share = np.clip((way * along).sum(-1) / length, 0.0, 1.0)
-        apart = np.linalg.norm(way - share[..., None] * along, axis=-1)
-        return np.where(self.made, apart, np.nan)
+        offset, leg = self.position[..., :2] - begin, end - begin
+        squared_length = np.maximum((leg**2).sum(-1), 1e-12)
+        fraction = np.clip((offset * leg).sum(-1) / squared_length, 0.0, 1.0)
+        distance = np.linalg.norm(offset - fraction[..., None] * leg, axis=-1)
+        return np.where(self.made, distance, np.nan)
 
     @property
     def heading_error(self) -> np.ndarray:
-        """Radians `[B, T]` between the heading and the motion; NaN where there is none."""
+        """Angle `[B, T]` between heading and motion, radians; NaN without motion."""
         motion = np.diff(self.position[..., :2], axis=1)
         course = np.arctan2(motion[..., 1], motion[..., 0])
         angle = np.abs(wrap(jnp.asarray(self.heading[:, :-1] - course)))
@@ -119,7 +119,7 @@ class WaypointRuns:
         return np.where(moves, angle, np.nan)
 
     def summary(self) -> dict[str, Any]:
-        """Means over the journeys: metres, seconds, radians, shares of the journeys."""
+        """Means over the runs: metres, seconds, radians, fractions of the runs."""
         reached, heading_error = self.arrival >= 0, self.heading_error
         times = [t[np.isfinite(t)] for t in self.times.T]
         return {
@@ -138,21 +138,21 @@ class WaypointRuns:
         return np.concatenate([self.position[:, :1, :2], self.waypoints[..., :2]], axis=1)
 
     def _leg(self, end: int) -> np.ndarray:
-        """Index `[B, T + 1, 1]` of a leg's beginning (0) or end (1) among the corners."""
+        """Corner `[B, T + 1, 1]` at the start (`end` = 0) or the end (`end` = 1) of the leg."""
         step = np.arange(self.position.shape[1])
         arrived = (self.arrival[:, None] >= 0) & (self.arrival[:, None] < step[:, None])
         return np.minimum(arrived.sum(-1), self.waypoints.shape[1] - 1)[..., None] + end
 
 
 class Walker(flax.struct.PyTreeNode):
-    """Robots on their way: where to, when they arrived there, and whether they go on.
+    """State of B runs between two steps.
 
     Attributes:
       robots: State `[B]`.
       waypoints: `[B, W, 3]`, metres.
-      arrival: `[B, W]`, step at which a waypoint was reached; −1 where it was not.
-      steps: `[B]`, made so far.
-      going: `[B]` bool.
+      arrival: `[B, W]`, step at which a waypoint was reached; −1 if it is not reached.
+      steps: `[B]`, number of steps so far.
+      going: `[B]` bool, False after the end of a run.
     """
 
     robots: State
@@ -175,30 +175,30 @@ def follow_waypoints(
     mesh: Mesh | None = None,
     quiet: bool = False,
 ) -> WaypointRuns:
-    """Leads robots through waypoints, each in its turn.
+    """Make robots walk through waypoints in order (§5.3).
 
     Args:
-      robot: what walks.
-      controller: what steers it; it is given the way to where the planner says.
-      waypoints: `[W, 2]` or `[W, 3]`, metres, or for each robot its own, `[B, W, 2]` or
-        `[B, W, 3]`; without a height they have a standing robot's.
-      keys: `[B]`, of the starts.
-      yaw: `[B]`, radians, that the starts are turned by.
-      planner: where to go next; straight to the next waypoint, unless given.
-      settings: length of a journey, goal radius.
-      record: what to keep of every state beside position and heading; nothing, unless given.
-      mesh: devices to share the robots among; as their engine wants, unless given.
-      quiet: no progress bar.
+      robot: robot to control.
+      controller: (s, relative goal) → a; the goal is the planner's target.
+      waypoints: `[W, 2]` or `[W, 3]`, metres, or different ones per robot, `[B, W, 2]` or
+        `[B, W, 3]`; the default height is that of a standing robot.
+      keys: random keys `[B]` of the starts.
+      yaw: `[B]`, rotations of the starts, radians.
+      planner: gives the next target; the default is the next waypoint.
+      settings: length of a run, goal radius.
+      record: what to keep of every state with position and heading; by default nothing.
+      mesh: devices that share the robots; None takes those of the robot's engine.
+      quiet: do not show a progress bar.
 
     Raises:
-      BadInput: no waypoints, or not of two or three finite numbers each; not a yaw a key; no
-        robots; planner or controller answer something else than they should.
+      BadInput: waypoints are empty, or are not two or three finite numbers each; keys and yaw
+        have different shapes; there are no robots; planner or controller return a wrong shape.
     """
     settings, mesh = settings or WaypointSettings(), mesh or robot.mesh()
     if jnp.ndim(keys) != 1 or jnp.shape(yaw) != keys.shape:
-        raise BadInput(f"keys [B] and yaw [B] are of {jnp.shape(keys)} and {jnp.shape(yaw)}")
+        raise BadInput(f"keys [B] and yaw [B] have shapes {jnp.shape(keys)} and {jnp.shape(yaw)}")
     if not len(keys):
-        raise BadInput("there are no robots to lead: keys [B] is empty")
+        raise BadInput("there are no robots: keys [B] is empty")
     points = _checked(waypoints, len(keys), robot.standing_height)
     walker = _start(robot, points, keys, yaw, mesh)
     controller = devices.put(as_tree(controller), mesh, None)
@@ -209,8 +209,8 @@ def follow_waypoints(
     seen = [jax.tree.map(lambda x: np.asarray(x)[None], look(walker.robots))]
     with Progress("waypoints", settings.max_steps, "steps", quiet=quiet) as bar:
         for made in range(0, settings.max_steps, settings.chunk):
-            walker, way = step(controller, walker)
-            seen.append(jax.tree.map(np.asarray, way))
+            walker, kept = step(controller, walker)
+            seen.append(jax.tree.map(np.asarray, kept))
             bar.advance(min(settings.chunk, settings.max_steps - made))
             if not np.asarray(walker.going).any():
                 break
@@ -218,18 +218,18 @@ def follow_waypoints(
 
 
 def in_twos(numbers: Sequence[float]) -> np.ndarray:
-    """Waypoints `[W, 2]` from x and y, x and y, …, as a command line gives them.
+    """Make waypoints `[W, 2]` from the numbers x, y, x, y, … of a command line.
 
     Raises:
-      BadInput: a number is left over.
+      BadInput: the number of numbers is odd.
     """
     if len(numbers) % 2:
-        raise BadInput(f"waypoints are x and y of each: an even number, not {len(numbers)}")
+        raise BadInput(f"waypoints are x and y, x and y, …: an even number, not {len(numbers)}")
     return np.reshape(numbers, (-1, 2))
 
 
 def _start(robot: Robot, points: np.ndarray, keys: jax.Array, yaw: jax.Array, mesh: Mesh) -> Walker:
-    """Robots at their starts; some twice, where the devices could not share them evenly."""
+    """Reset the robots; repeat some, so that the devices share them evenly."""
     fill = np.arange(-(-len(yaw) // mesh.size) * mesh.size) % len(yaw)
     walker = Walker(
         robots=jax.jit(robot.reset)(keys[fill], jnp.asarray(yaw, jnp.float32)[fill]),
@@ -246,9 +246,9 @@ def _seen(record: Record, robots: State) -> tuple[jax.Array, jax.Array, Any]:
 
 
 def _waypoint_runs(robot: Robot, walker: Walker, seen: list[Any], count: int) -> WaypointRuns:
-    """What has become of the first `count` robots, seen `[steps, B, ...]` again and again."""
+    """Make the runs of the first `count` robots from parts `[steps, B, ...]`."""
     steps = np.asarray(walker.steps)[:count]
-    end = steps.max() + 1  # the last chunk may go on beyond it
+    end = steps.max() + 1  # the last chunk may be longer
 
     def join(*parts: Any) -> np.ndarray:
         return np.concatenate(parts).swapaxes(0, 1)[:count, :end]
@@ -268,11 +268,13 @@ def _waypoint_runs(robot: Robot, walker: Walker, seen: list[Any], count: int) ->
 
 
 def _checked(waypoints: Any, count: int, height: float) -> np.ndarray:
-    """Waypoints `[B, W, 3]` of so many robots; raises BadInput for what is none."""
+    """Waypoints `[B, W, 3]` of `count` robots; raises BadInput if they are invalid."""
     try:
         points = np.asarray(waypoints, float)
     except ValueError:
-        raise BadInput("waypoints are rows of two or three numbers, each of as many") from None
+        raise BadInput(
+            "waypoints are rows of two or three numbers, all of the same length"
+        ) from None
     shaped = points.ndim in (2, 3) and points.shape[-1] in (2, 3) and points.shape[-2] > 0
     if not shaped or (points.ndim == 3 and len(points) != count):
         raise BadInput(
@@ -281,8 +283,8 @@ def _checked(waypoints: Any, count: int, height: float) -> np.ndarray:
         )
     if not np.isfinite(points).all():
         raise BadInput("waypoints must be finite numbers")
-    level = np.full((*points.shape[:-1], 3 - points.shape[-1]), height)
-    points = np.concatenate([points, level], axis=-1)
+    z = np.full((*points.shape[:-1], 3 - points.shape[-1]), height)
+    points = np.concatenate([points, z], axis=-1)
     return np.broadcast_to(points, (count, *points.shape[-2:]))
 
 
@@ -294,9 +296,9 @@ def _chunk(
     controller: ControllerFn,
     walker: Walker,
 ) -> tuple[Walker, Any]:
-    """`settings.chunk` steps; and what is seen `[chunk, B, ...]` after each.
+    """Step the robots `settings.chunk` times; return what is kept, `[chunk, B, ...]`.
 
-    Robots that have ended stay as they are.
+    The state of a run does not change after its end.
     """
     points = walker.waypoints
 
@@ -308,12 +310,12 @@ def _chunk(
         return robots, steered(robot, controller, robots, target), None
 
     def watch(walker: Walker, move: Move) -> tuple[Walker, Any]:
-        after, steps, left = move.after, walker.steps + 1, walker.arrival < 0
-        turn = left & (jnp.cumsum(left, axis=-1) == 1)  # the first that is left
+        after, steps, unreached = move.after, walker.steps + 1, walker.arrival < 0
+        first = unreached & (jnp.cumsum(unreached, axis=-1) == 1)
         near = horizontal_norm(points - after.position[:, None]) <= settings.goal_radius
-        arrival = jnp.where(turn & near, steps[:, None], walker.arrival)
-        through = (arrival >= 0).all(-1)
-        over = after.fallen | after.diverged | through | (steps >= settings.max_steps)
+        arrival = jnp.where(first & near, steps[:, None], walker.arrival)
+        finished = (arrival >= 0).all(-1)
+        over = after.fallen | after.diverged | finished | (steps >= settings.max_steps)
         walker = select(walker.going, Walker(after, points, arrival, steps, ~over), walker)
         return walker, look(walker.robots)
 

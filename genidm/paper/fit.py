@@ -1,4 +1,4 @@
-"""Fitting IDM and LFM/IDM (A.1.2): one jitted loop for every method, over the losses of `idm`."""
+"""The fit of an IDM, or of an LFM and an IDM (A.1.2): one jitted loop; the losses are in `idm`."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from genidm.robots.base import Robot
 from genidm.store import Stage
 
 STD_FLOOR = 1e-2
-# A minibatch of the Ant, in two views through two layers of 256, then takes 3 GB.
+# A minibatch of this size takes 3 GB for the Ant: two views through two layers of 256.
 MOST_IN_BATCH = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Settings of a fit.
+    """Settings of a fit (A.1.2).
 
-    States are normalised by the mean and standard deviation of the samples; the deviation
-    counts as 0.01 at least, so that numbers that hardly ever move are not blown up.
+    States are normalised by the mean and standard deviation of the samples. The standard
+    deviation is at least 0.01, so that nearly constant numbers are not amplified.
 
     Attributes:
-      updates: minibatches learned from.
-      batch_size: samples a minibatch (A.1.2: 512).
-      learning_rate: of Adam (A.1.2: 1e-3), at the start.
-      cosine_decay: the learning rate falls to 0 along a cosine; off, it stays (the paper's).
+      updates: number of minibatches.
+      batch_size: samples per minibatch (A.1.2: 512).
+      learning_rate: initial learning rate of Adam (A.1.2: 1e-3).
+      cosine_decay: reduce the learning rate to 0 along a cosine; False keeps it constant (A.1.2).
       idm: hidden layers of φ (Table 2).
       lfm: hidden layers of ψ (Table 2).
-      latent_size: k; None fits an IDM alone.
+      latent_size: k (Eq. 3); None fits an IDM without an LFM.
       latent_loss_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
-      mean_latent: φ is fitted to the mean of a pair's latents (Eq. 6); off, to each of them. The
-        mean hides what the two differ by, and in the test there is one latent alone.
+      mean_latent: fit φ to the mean of a pair's latents (Eq. 6); False fits it to each latent.
+        The mean hides the difference of the two, and the test has one latent only (Remark 1).
     """
 
     updates: int = 20_000
@@ -71,7 +71,7 @@ class Fit:
         )
 
     def optimizer(self) -> optax.GradientTransformation:
-        """Adam, with the schedule."""
+        """Make Adam with the learning rate schedule."""
         rate = self.learning_rate
         return optax.adam(
             optax.cosine_decay_schedule(rate, self.updates) if self.cosine_decay else rate
@@ -79,24 +79,24 @@ class Fit:
 
 
 def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:
-    """A minibatch from all views alike: G as a set (GE), `s [1, size, S]`."""
-    which, seen = jax.random.split(key)
-    n = jax.random.randint(which, (size,), 0, samples.a.shape[0])
-    v = jax.random.randint(seen, (size,), 0, samples.s.shape[0])
+    """Draw a minibatch from all views alike (G as a set, GE), with `s [1, size, S]`."""
+    sample_key, view_key = jax.random.split(key)
+    n = jax.random.randint(sample_key, (size,), 0, samples.a.shape[0])
+    v = jax.random.randint(view_key, (size,), 0, samples.s.shape[0])
     return Pairs(samples.s[v, n][None], samples.d[v, n][None], samples.a[n])
 
 
 def draw_siamese(samples: Pairs, key: jax.Array, size: int) -> Pairs:
-    """A minibatch of e.m.o. pairs: the record and one of its copies, `s [2, size, S]`."""
-    which, seen = jax.random.split(key)
-    n = jax.random.randint(which, (size,), 0, samples.a.shape[0])
-    v = jax.random.randint(seen, (size,), 1, samples.s.shape[0])
+    """Draw a minibatch of e.m.o. pairs, the record and one of its copies, with `s [2, size, S]`."""
+    sample_key, view_key = jax.random.split(key)
+    n = jax.random.randint(sample_key, (size,), 0, samples.a.shape[0])
+    v = jax.random.randint(view_key, (size,), 1, samples.s.shape[0])
     both = jnp.stack([jnp.zeros_like(v), v])
     return Pairs(samples.s[both, n], samples.d[both, n], samples.a[n])
 
 
 class FitState(flax.struct.PyTreeNode):
-    """All that a fit carries from one update to the next."""
+    """Everything that a fit carries from one update to the next."""
 
     model: Controller
     optimizer: Any
@@ -115,52 +115,52 @@ def fit(
     chunk: int = 1000,
     quiet: bool = False,
 ) -> Controller:
-    """Fits a controller to samples.
+    """Fit a controller to samples (A.1.2).
 
     Args:
-      robot: whose states and actions the samples hold.
-      samples: E, or G = E ∪ 𝒢(E); with a latent they need two views at least. They lie on
-        one device while they are learned from: an accelerator if it has the room, else the CPU.
-      key: of the parameters and the minibatches.
+      robot: robot whose states and actions the samples hold.
+      samples: E, or G = E ∪ 𝒢(E); an LFM needs at least two views. The fit copies them to one
+        device: an accelerator if it has enough memory, else the CPU.
+      key: random key of the parameters and the minibatches.
       settings: networks, losses, schedule.
-      input_frame: the frame that the models see s and d in.
-      stage: where checkpoints and metrics go; nowhere, unless given.
-      chunk: updates a program call.
-      quiet: no progress bar.
+      input_frame: frame of the s and d that the models see.
+      stage: where to write checkpoints and metrics; None writes nothing.
+      chunk: updates per program call.
+      quiet: do not show a progress bar.
 
     Raises:
-      BadInput: a latent was asked for, and there is only one view; or the parameters are not
-        finite any more.
+      BadInput: the settings have a latent, but the samples have one view; or a parameter is
+        not finite any more.
     """
     settings = settings or Fit()
     if settings.latent_size is not None and samples.s.shape[0] < 2:
-        raise BadInput("an LFM is fitted to pairs, and these samples have one view only")
+        raise BadInput("an LFM needs pairs, but these samples have one view only")
     samples = jax.device_put(
         samples, devices.pick_device(sum(x.nbytes for x in jax.tree.leaves(samples)))
     )
-    samples = jax.jit(functools.partial(_framed, robot, input_frame))(samples)
-    learner, updates = training(robot, samples, key, settings, input_frame)
+    samples = jax.jit(functools.partial(_in_input_frame, robot, input_frame))(samples)
+    state, updates = training(robot, samples, key, settings, input_frame)
     checkpoints = stage.checkpoints() if stage else None
-    found = checkpoints.latest(learner) if checkpoints else None
-    done, learner = (found[0], _beside(samples, found[1])) if found else (0, learner)
-    program = compile_ahead("fit", updates, learner, samples, jnp.int32(0))
+    found = checkpoints.latest(state) if checkpoints else None
+    done, state = (found[0], _on_device_of(samples, found[1])) if found else (0, state)
+    program = compile_ahead("fit", updates, state, samples, jnp.int32(0))
     directory = stage.directory if stage else None
     with Progress("fit", settings.updates, "updates", directory, done, quiet) as bar:
         while done < settings.updates:
             count = min(chunk, settings.updates - done)
-            learner, info = program(learner, samples, jnp.int32(count))
+            state, info = program(state, samples, jnp.int32(count))
             done += count
             bar.advance(count, **{name: float(x) for name, x in info.items()})
-            _check_fitted(learner.model, done)
+            _check_fitted(state.model, done)
             if checkpoints and checkpoints.due():
-                checkpoints.save(done, learner)
-    return learner.model
+                checkpoints.save(done, state)
+    return state.model
 
 
 def _check_fitted(model: Controller, updates: int) -> None:
     if name := trees.not_finite(model):
         raise BadInput(
-            f"{name} holds NaN or infinity after {updates} updates: what was fitted is of no use. "
+            f"{name} holds NaN or infinity after {updates} updates: the fit has failed. "
             "A smaller learning rate may help"
         )
 
@@ -168,29 +168,29 @@ def _check_fitted(model: Controller, updates: int) -> None:
 def training(
     robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, input_frame: Frame = "world"
 ) -> tuple[FitState, Any]:
-    """A fit before its first update, and the program of its updates.
+    """Make the state of a fit before its first update, and the function of its updates.
 
     Args:
-      robot: whose states and actions the samples hold.
+      robot: robot whose states and actions the samples hold.
       samples: `[V, N, ...]`, with s and d in `input_frame` already, on one device.
-      key: of the parameters and the minibatches.
+      key: random key of the parameters and the minibatches.
       settings: networks, losses, schedule.
-      input_frame: the frame that the controller turns what it is given into.
+      input_frame: frame into which the controller rotates its inputs.
 
     Returns:
-      the learner, and the jitted (learner, samples, count) → (learner, mean losses) of
-      `count` updates, which donates the learner.
+      the FitState, and the jitted (FitState, samples, count) → (FitState, mean losses) of
+      `count` updates, which donates the FitState.
     """
-    learner = _start(robot, samples, key, settings, input_frame)
-    return learner, jax.jit(_updates(settings), donate_argnums=0)
+    state = _start(robot, samples, key, settings, input_frame)
+    return state, jax.jit(_updates(settings), donate_argnums=0)
 
 
-def _beside(samples: Pairs, tree: Any) -> Any:
-    # One device: a fit is matrix products, which XLA spreads over the cores by itself.
+def _on_device_of(samples: Pairs, tree: Any) -> Any:
+    # One device is enough: XLA itself spreads the matrix products of a fit over the cores.
     return jax.device_put(tree, jnp.asarray(samples.a).device)
 
 
-def _framed(robot: Robot, input_frame: Frame, samples: Pairs) -> Pairs:
+def _in_input_frame(robot: Robot, input_frame: Frame, samples: Pairs) -> Pairs:
     s, d = in_frame(robot, input_frame, samples.s, samples.d)
     return Pairs(s, d, samples.a)
 
@@ -209,12 +209,12 @@ def _start(
         input_frame=input_frame,
         robot=robot,
     )
-    state = settings.optimizer().init(model.params)
-    return _beside(samples, FitState(model, state, stream, jnp.zeros((), jnp.int32)))
+    optimizer = settings.optimizer().init(model.params)
+    return _on_device_of(samples, FitState(model, optimizer, stream, jnp.zeros((), jnp.int32)))
 
 
 def _updates(settings: Fit) -> Any:
-    """The function (learner, samples, count) → (learner, mean losses) of `count` updates."""
+    """Make the function (FitState, samples, count) → (FitState, mean losses) of `count` updates."""
     siamese = settings.latent_size is not None
     draw = draw_siamese if siamese else draw_plain
     loss = (
@@ -228,26 +228,26 @@ def _updates(settings: Fit) -> Any:
     )
     optimizer = settings.optimizer()
 
-    def update(learner: FitState, samples: Pairs) -> tuple[FitState, dict[str, jax.Array]]:
-        # The key of an update depends on its number alone, not on the call it is in.
-        batch = draw(samples, jax.random.fold_in(learner.key, learner.update), settings.batch_size)
+    def update(state: FitState, samples: Pairs) -> tuple[FitState, dict[str, jax.Array]]:
+        # The key depends on the update's number alone, so that `chunk` does not change the result.
+        batch = draw(samples, jax.random.fold_in(state.key, state.update), settings.batch_size)
 
         def of_params(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-            return loss(learner.model.replace(params=params), batch)
+            return loss(state.model.replace(params=params), batch)
 
-        grads, info = jax.grad(of_params, has_aux=True)(learner.model.params)
-        step, state = optimizer.update(grads, learner.optimizer)
-        model = learner.model.replace(params=optax.apply_updates(learner.model.params, step))
-        return FitState(model, state, learner.key, learner.update + 1), info
+        grads, info = jax.grad(of_params, has_aux=True)(state.model.params)
+        step, optimizer_state = optimizer.update(grads, state.optimizer)
+        model = state.model.replace(params=optax.apply_updates(state.model.params, step))
+        return FitState(model, optimizer_state, state.key, state.update + 1), info
 
-    def run(learner: FitState, samples: Pairs, count: jax.Array) -> tuple[FitState, dict]:
+    def run(state: FitState, samples: Pairs, count: jax.Array) -> tuple[FitState, dict]:
         def body(_: int, carry: tuple[FitState, dict]) -> tuple[FitState, dict]:
-            learner, info = update(carry[0], samples)
-            return learner, jax.tree.map(jnp.add, carry[1], info)
+            state, info = update(carry[0], samples)
+            return state, jax.tree.map(jnp.add, carry[1], info)
 
-        _, shapes = jax.eval_shape(update, learner, samples)
+        _, shapes = jax.eval_shape(update, state, samples)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        learner, info = jax.lax.fori_loop(0, count, body, (learner, zeros))
-        return learner, jax.tree.map(lambda x: x / count, info)
+        state, info = jax.lax.fori_loop(0, count, body, (state, zeros))
+        return state, jax.tree.map(lambda x: x / count, info)
 
     return run

@@ -1,10 +1,10 @@
-"""𝒢 (Def. 4): the record's own actions, replayed from a turned start, and the Pairs they give.
+"""Generalized experience 𝒢(E) (Def. 4): recorded actions, replayed from rotated starts.
 
-Replayed physics is chaotic: rounding takes an Ant's way off the exactly turned one after some
-tens of steps (docs/physics.md). So 𝒢 replays *segments*: every H steps the robot is placed on
-the record again, turned by a new yaw; H is what the engine's rounding allows. Def. 4 allows
-any trajectory τ ⊆ E.
-Whole episodes (§5.2 to the letter) and exact rotation without physics are modes too.
+Replayed physics is chaotic: after some tens of steps, rounding moves a replayed Ant away from
+the exactly rotated record (docs/physics.md). So 𝒢 replays *segments*: every H steps it places
+the robot on the record again, rotated by a new yaw. The engine's rounding limits H. Def. 4
+allows any trajectory τ ⊆ E. The other modes replay whole episodes (§5.2 to the letter), or
+rotate the record exactly, without physics.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class Generalize:
 
     Attributes:
       mode: "segments" places the robot on the record again every `segment` steps;
-        "episodes" replays whole episodes (the paper's §5.2); "rotate" turns the record
-        exactly, without physics.
-      segment: steps of a segment, H; as many as the robot's engine allows, unless given.
-      copies: turned copies of the record.
-      num_envs: robots replayed at once; see `Robot.max_parallel_envs`.
+        "episodes" replays whole episodes (§5.2); "rotate" rotates the record exactly,
+        without physics.
+      segment: H, steps per segment; None takes the number of the robot's engine.
+      copies: number of rotated copies of the record.
+      num_envs: robots to replay at once; see `Robot.max_parallel_envs`.
     """
 
     mode: Mode = "segments"
@@ -52,7 +52,7 @@ class Generalize:
         check(self, segment=optional(count()), copies=count(1, 1000), num_envs=count())
 
     def on(self, robot: Robot) -> Generalize:
-        """The settings with a segment's length chosen for the robot, unless it is given."""
+        """Fill in the segment length of the robot's engine where `segment` is None."""
         if self.segment is not None:
             return self
         engine = robot.engine or Engine
@@ -68,18 +68,18 @@ def replay(
     mesh: Mesh | None = None,
     quiet: bool = False,
 ) -> RotatedReplay:
-    """𝒢(E): the record's actions replayed from starts turned by random yaws.
+    """Replay the record's actions from starts rotated by random yaws: 𝒢(E) (Def. 4).
 
     Args:
-      robot: the robot that the record is of.
+      robot: robot of the record.
       experience: E, `[T, B, ...]`.
-      key: of the yaws.
+      key: random key of the yaws.
       settings: mode, segment length and number of copies.
-      mesh: devices to share the lanes among; as the robot's engine wants, unless given.
-      quiet: no progress bar.
+      mesh: devices that share the lanes; None takes those of the robot's engine.
+      quiet: do not show a progress bar.
 
     Raises:
-      BadInput: the record is unusable, or holds no physics and the mode needs it.
+      BadInput: the record is invalid, or it holds no physics and the mode needs physics.
     """
     settings = (settings or Generalize()).on(robot)
     if settings.mode == "rotate":
@@ -104,7 +104,7 @@ def replay(
 def rotate_exactly(
     robot: Robot, experience: Experience, key: jax.Array, copies: int = 1
 ) -> RotatedReplay:
-    """The record turned exactly, each sample by a yaw of its own, without physics."""
+    """Rotate the record exactly, each sample by its own random yaw, without physics (Def. 3)."""
     experience = experience.prepared(robot)
     shape = (copies, *experience.first.shape)
     yaw = jax.random.uniform(key, shape, jnp.float32, minval=-jnp.pi, maxval=jnp.pi)
@@ -122,16 +122,16 @@ def rotate_exactly(
 def residual(
     experience: Experience, turned: RotatedReplay, steps: int = 200
 ) -> dict[str, np.ndarray]:
-    """How far the replay leaves the exact rotation of the record (e.m.o., Def. 3).
+    """Measure the distance between the replay and the exactly rotated record (Def. 3).
 
     Args:
       experience: the record.
-      turned: its replay.
-      steps: greatest number of steps since placing to report.
+      turned: the rotated replay of the record.
+      steps: largest number of steps after a placement to report.
 
     Returns:
-      "step" `[n]`, and "median", "p90" `[n]`: metres between o_next replayed and the
-      record's own turned, over all samples that many steps after a placing.
+      "step" `[n]`, steps after a placement; "median" and "p90" `[n]`, metres between the
+      replayed o_next and the rotated o_next of the record, over all samples at that step.
     """
     record = experience.centred() if experience.far_away else experience
     o_next = jnp.asarray(record.o_next, jnp.float32)
@@ -140,9 +140,9 @@ def residual(
     since = np.arange(distance.shape[1])[:, None] - turned.start
     rows = []
     for n in range(min(steps, int(since.max()) + 1)):
-        there = np.broadcast_to(since == n, distance.shape) & turned.valid
-        if there.any():
-            rows.append((n + 1, *np.quantile(distance[there], [0.5, 0.9])))
+        at_step = np.broadcast_to(since == n, distance.shape) & turned.valid
+        if at_step.any():
+            rows.append((n + 1, *np.quantile(distance[at_step], [0.5, 0.9])))
     step, median, p90 = np.asarray(rows, np.float64).reshape(-1, 3).T
     return {"step": step, "median": median, "p90": p90}
 
@@ -156,18 +156,20 @@ def generalize(
     goal_horizon: int = 100,
     mirror: bool = False,
 ) -> tuple[Pairs, dict[str, np.ndarray]]:
-    """𝒢 from record to Pairs, and the e.m.o. residual; `replay` and `pairs` in one.
+    """Make Pairs from a record by 𝒢 (Def. 4), and measure their residual.
+
+    Calls `replay`, `pairs` and `residual`.
 
     Args:
-      robot: the robot that the record is of.
+      robot: robot of the record.
       experience: E, `[T, B, ...]`.
-      key: of the yaws.
-      settings: of 𝒢.
+      key: random key of the yaws.
+      settings: settings of 𝒢.
       goal_horizon: h, steps to the intermediate goal o'.
-      mirror: adds the reflection of every sample; not in the paper.
+      mirror: add the reflection of every sample; not in the paper.
 
     Returns:
-      the samples, and the residual as `residual` gives it, in metres.
+      the samples, and the result of `residual`, in metres.
     """
     turned = replay(robot, experience, key, settings)
     samples = pairs(robot, experience, turned, goal_horizon=goal_horizon, mirror=mirror)

@@ -1,6 +1,7 @@
-"""The two models and what they minimise: Def. 2, Def. 5, Eq. 1 and Eq. 3–7.
+"""The two models and their losses: Def. 2, Def. 5, Eq. 1 and Eq. 3–7.
 
-φ is the inverse dynamics model (IDM), ψ the latent feature model (LFM).
+φ is the inverse dynamics model (IDM), ψ the latent feature model (LFM). The models see (s, d)
+in place of (s, o, o') (Remark 2). Eq. 2 is in `pairs`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from genidm.paper.pairs import Pairs
 
 
 class MLP(nn.Module):
-    """A multilayer perceptron with ReLU, linear at the end.
+    """A multilayer perceptron with ReLU and a linear output layer.
 
     Attributes:
       policy_hidden_layer_sizes: widths of the hidden layers.
@@ -35,7 +36,7 @@ class MLP(nn.Module):
 
 def _apply(model: MLP, params: Any, x: jax.Array) -> jax.Array:
     out = model.apply(params, x)
-    assert isinstance(out, jax.Array)  # and no state beside it
+    assert isinstance(out, jax.Array)  # not (out, state): no collection is mutable
     return out
 
 
@@ -44,7 +45,7 @@ class Architecture:
     """Shape of the models (Table 2).
 
     Attributes:
-      action_size: A.
+      action_size: A, length of an action.
       idm: hidden layers of φ.
       lfm: hidden layers of ψ; unused without a latent.
       latent_size: k, or None for an IDM without LFM (RS, RL, GE).
@@ -56,7 +57,7 @@ class Architecture:
     latent_size: int | None
 
     def init(self, key: jax.Array, state_size: int) -> dict[str, object]:
-        """Fresh parameters {"idm": …} and, with a latent, {"lfm": …}."""
+        """Initialise parameters: {"idm": …} and, with a latent, {"lfm": …}."""
         psi, phi = jax.random.split(key)
         x = jnp.zeros(state_size + 3, jnp.float32)
         if self.latent_size is None:
@@ -73,43 +74,43 @@ class Architecture:
         return MLP(self.lfm, self.latent_size or 0)
 
     def latent(self, params: dict, s: jax.Array, d: jax.Array) -> jax.Array:
-        """ψ(s, d) = γ `[..., k]` (Eq. 3); without an LFM, the pair (s, d) `[..., S + 3]` itself.
+        """Compute ψ(s, d) = γ `[..., k]` (Def. 5, Eq. 3); without an LFM, (s, d) `[..., S + 3]`.
 
         Args:
-          params: from `init`.
+          params: parameters from `init`.
           s: normalised states `[..., S]`.
-          d: unit vectors `[..., 3]`.
+          d: unit vectors `[..., 3]` (Remark 2).
         """
         x = jnp.concatenate([s, d], axis=-1)
         return x if self.latent_size is None else _apply(self._lfm(), params["lfm"], x)
 
     def action(self, params: dict, latent: jax.Array) -> jax.Array:
-        """φ(γ) = a `[..., A]` (Eq. 4, or Eq. 1 without an LFM)."""
+        """Compute φ(γ) = a `[..., A]` (Eq. 4); without an LFM, φ(s, d) = a (Def. 2, Eq. 1)."""
         return _apply(self._idm(), params["idm"], latent)
 
 
 class Model(Protocol):
-    """ψ and φ with their parameters, as the losses ask for them."""
+    """ψ and φ with their parameters, as the losses use them."""
 
     def latent(self, s: jax.Array, d: jax.Array) -> jax.Array:
-        """γ = ψ(s, d) `[..., k]` (Eq. 3); without an LFM (s, d) itself."""
+        """Compute γ = ψ(s, d) `[..., k]` (Eq. 3); without an LFM, (s, d)."""
 
     def action(self, latent: jax.Array) -> jax.Array:
-        """φ(γ) `[..., A]` (Eq. 4; Eq. 1 without an LFM)."""
+        """Compute φ(γ) `[..., A]` (Eq. 4; Eq. 1 without an LFM)."""
 
 
 def loss_latent(latent: jax.Array, latent_hat: jax.Array) -> jax.Array:
-    """L1 (Eq. 5): squared distance of the latents `[..., k]` of e.m.o. samples, batch mean."""
+    """L1 (Eq. 5): squared distance between latents `[..., k]` of e.m.o. samples, batch mean."""
     return jnp.mean(jnp.sum((latent - latent_hat) ** 2, axis=-1))
 
 
 def loss_action(predicted: jax.Array, action: jax.Array) -> jax.Array:
-    """L2 (Eq. 6): squared distance of actions `[..., A]`, batch mean."""
+    """L2 (Eq. 6): squared distance between actions `[..., A]`, batch mean."""
     return jnp.mean(jnp.sum((predicted - action) ** 2, axis=-1))
 
 
 def loss_plain(model: Model, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L2 of an IDM on samples of one view each; what RS, RL and GE minimise."""
+    """L2 of an IDM on samples with one view: the loss of methods without an LFM (RS, RL, GE)."""
     action = loss_action(model.action(model.latent(batch.s[0], batch.d[0])), batch.a)
     return action, {"loss": action, "loss_action": action}
 
@@ -117,11 +118,14 @@ def loss_plain(model: Model, batch: Pairs) -> tuple[jax.Array, dict[str, jax.Arr
 def loss_siamese(
     model: Model, batch: Pairs, latent_loss_weight: float, mean_latent: bool
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """L = λ L1 + (1 − λ) L2 (Eq. 7) on samples in two views; φ sees their mean latent, or each."""
+    """L = λ L1 + (1 − λ) L2 (Eq. 7, Fig. 4) on samples with two views.
+
+    φ sees the mean of the two latents (Eq. 6) if `mean_latent` is True, else each latent.
+    """
     latents = model.latent(batch.s, batch.d)
     latent = loss_latent(latents[0], latents[1])
-    seen = latents.mean(0, keepdims=True) if mean_latent else latents
-    predicted = model.action(seen)
+    phi_input = latents.mean(0, keepdims=True) if mean_latent else latents
+    predicted = model.action(phi_input)
     action = loss_action(predicted, jnp.broadcast_to(batch.a, predicted.shape))
     loss = latent_loss_weight * latent + (1 - latent_loss_weight) * action
     return loss, {"loss": loss, "loss_latent": latent, "loss_action": action}

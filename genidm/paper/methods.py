@@ -1,4 +1,4 @@
-"""The methods of Table 1, as data: what each is made of (Table 2), and nothing else.
+"""The methods of Table 1 (§5.1, §5.2) as data, with the networks and algorithms of Table 2.
 
 An experiment runs the stages that a method names. To try something new, copy a method
 with `dataclasses.replace` and change one thing.
@@ -28,12 +28,12 @@ from genidm.tasks import Dense, GoToGoal, Sparse, WalkForward
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A way to a controller.
+    """Settings that make a controller.
 
     Attributes:
-      name: as it stands in the table.
-      agent: what collects the experience, or is itself the controller.
-      task: what the agent is rewarded for meanwhile.
+      name: name of the method in the table.
+      agent: collects the experience, or is itself the controller.
+      task: gives the agent its rewards.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Method:
 
 @dataclasses.dataclass(frozen=True)
 class GoalConditioned(Method):
-    """A baseline (§5.1): the agent learns to go to goals, and its policy is the controller."""
+    """A baseline (§5.1): the agent learns to reach goals, and its policy is the controller."""
 
     agent: LearningAgent
     task: GoToGoal
@@ -54,16 +54,16 @@ class GoalConditioned(Method):
 
 @dataclasses.dataclass(frozen=True)
 class InverseDynamics(Method):
-    """From experience that was never goal-directed to a controller, by inverse dynamics (§4).
+    """Inverse dynamics (§4): a controller fitted to experience without goals.
 
     Attributes:
-      fraction: the part of the record, from its start, that is learned from. The paper's GE
-        and LR make the other half with 𝒢 (A.1.2).
-      generalize: settings of 𝒢; None learns from the record alone.
-      goal_horizon: h, steps to the intermediate goal o'; 1 is the paper's "next position".
-        Steps whose episode ends before are left out.
-      mirror: adds the reflection of every sample; not in the paper.
-      input_frame: "heading" turns every input so that the robot faces +x; not in the paper.
+      fraction: fraction of the record, from its start, to learn from. For the paper's GE and
+        LR, 𝒢 makes the other half (A.1.2).
+      generalize: settings of 𝒢; None learns from the record only.
+      goal_horizon: h, steps to the intermediate goal o' (Def. 1); 1 is the paper's "next
+        position". Steps whose episode ends earlier are left out.
+      mirror: add the reflection of every sample; not in the paper.
+      input_frame: "heading" rotates every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
     """
 
@@ -96,16 +96,16 @@ WALK = WalkForward()
 
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """What we choose for a robot where the paper is silent.
+    """Our settings for a robot where the paper is silent.
 
-    The layers of every policy are Table 2's, whatever these agents have.
+    The hidden layers of every policy are those of Table 2, not those of these agents.
 
     Attributes:
       ppo: settings of PPO.
       sac: settings of SAC.
       ddpg: settings of DDPG.
-      goal_horizon: h of what is learned from random actions (RS).
-      mirror: whether HF also learns from mirror images: where the gait is its own.
+      goal_horizon: h of RS.
+      mirror: whether HF also learns from mirror images; True if the gait is symmetric.
     """
 
     ppo: PPO = dataclasses.field(default_factory=PPO)
@@ -115,7 +115,7 @@ class Choices:
     mirror: bool = True
 
     def agent(self, training: protocol.Training, her: HER | None = None) -> LearningAgent:
-        """The agent of a row of Table 2."""
+        """Make the agent of a row of Table 2."""
         agents: dict[str, Any] = {"PPO": self.ppo, "SAC": self.sac, "DDPG": self.ddpg}
         relabelling = {"her": her} if her else {}
         agent: LearningAgent = dataclasses.replace(
@@ -127,7 +127,10 @@ class Choices:
 
 
 def column(robot: str, choices: Choices) -> Column:
-    """Table 1's rows for one robot as Table 2 and A.1.2 have them, and HF."""
+    """Make the methods of Table 1 for one robot, with the settings of Table 2 and A.1.2.
+
+    The last is HF, which is not in the paper: RL in the heading frame.
+    """
     table = protocol.TABLE2[robot]
 
     def inverse(name: str, latent_size: int | None = None) -> InverseDynamics:
@@ -148,7 +151,7 @@ def column(robot: str, choices: Choices) -> Column:
         return GoalConditioned(name, choices.agent(table[name], her), task)
 
     lr = inverse("LR", protocol.LATENT_SIZE[robot])
-    # λ and latents as measured (docs/choices.md); `paper_settings` has the paper's.
+    # These come nearer than the paper's (docs/choices.md), which `paper_settings` has.
     lr_fit = dataclasses.replace(lr.fit, latent_loss_weight=0.75, mean_latent=False)
     rl = inverse("RL")
     return (
@@ -177,21 +180,21 @@ ANT = column("ant", Choices())
 HUMANOID = column(
     "humanoid",
     Choices(
-        # Of 0.0165 s a step: at 0.98 the agent would look 0.8 s ahead, and throw itself forwards.
+        # A step is 0.0165 s: 0.98 looks 0.8 s ahead only, and the robot throws itself forwards.
         sac=SAC(grad_updates_per_step=64, discounting=0.99, layer_norm=True),
-        # Moved at random it lies down within 25 steps: farther ahead there is nothing to be seen.
+        # Random actions make the robot fall within 25 steps: a longer horizon has few samples.
         goal_horizon=10,
-        # The gait is not its own mirror image: fitted to both, HF falls (docs/choices.md).
+        # The gait is not symmetric: with mirror images, HF falls (docs/choices.md).
         mirror=False,
     ),
 )
 MINITAUR = column(
     "minitaur",
     Choices(
-        # It stands by itself, so nothing is paid for noise, which would hide the gait
+        # The robot stands by itself, and an entropy bonus would hide the gait in noise
         # (docs/choices.md).
         ppo=PPO(entropy_cost=0.0),
-        # This gait veers to one side: it is not its own mirror image, either.
+        # This gait veers to one side: it is not symmetric either.
         mirror=False,
     ),
 )
@@ -199,10 +202,10 @@ MINITAUR = column(
 RS, RL, VGCP, HER_SP, HER_DE, GE, LR, HF = ANT
 
 EXTRA = ("HF",)
-"""Methods that the paper does not have."""
+"""Methods that are not in the paper."""
 
 ORDER = tuple(method.name for method in ANT)
-"""Rows of the table, top to bottom; other names follow."""
+"""Order of the rows of the table; other names follow."""
 
 TABLES = {
     "ant": ANT,
@@ -210,14 +213,14 @@ TABLES = {
     "humanoid_world": HUMANOID,
     "minitaur": MINITAUR,
 }
-"""Robot → the methods of its column. A robot without one has the Ant's."""
+"""Robot → the methods of its column; other robots use the Ant's."""
 
 
 def by_name(name: str, robot: str = "ant") -> GoalConditioned | InverseDynamics:
-    """The method of that name, with its settings for a robot.
+    """Find a method by its name, with its settings for a robot.
 
     Raises:
-      BadInput: there is none.
+      BadInput: no method has this name.
     """
     for method in TABLES.get(robot, ANT):
         if method.name == name:
@@ -226,10 +229,10 @@ def by_name(name: str, robot: str = "ant") -> GoalConditioned | InverseDynamics:
 
 
 def paper_settings(method: InverseDynamics) -> InverseDynamics:
-    """The method to the paper's letter.
+    """Give a method the paper's settings where ours differ.
 
-    h = 1, whole-episode replay (§5.2), λ = 0.25, φ fitted to mean latents (Eq. 6), and Adam
-    at 1e-3 throughout (A.1.2).
+    h = 1 (Def. 1), whole-episode replay (§5.2), λ = 0.25 (A.1.2), φ fitted to mean latents
+    (Eq. 6), and Adam with a constant learning rate (A.1.2).
     """
     return dataclasses.replace(
         method,

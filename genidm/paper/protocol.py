@@ -1,7 +1,7 @@
 """The paper's numbers: Table 1, Table 2, A.1.2 and A.1.3, for its three robots.
 
-Nothing here is ours. What we choose where the paper is silent is in `methods`; what a run
-departs from is printed at its start and stored with it.
+Nothing here is ours. Our choices, where the paper is silent, are in `methods`. A run prints
+and stores its differences from the paper.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ class Training:
     """A row of Table 2.
 
     Attributes:
-      policy: hidden layers of the policy that collects, or that is trained to reach goals.
+      policy: hidden layers of the policy that collects experience, or walks to goals.
       lfm: hidden layers of ψ.
       idm: hidden layers of φ.
-      algorithm: which trains the policy.
+      algorithm: RL algorithm that trains the policy; None for random actions.
     """
 
     policy: Layers | None = None
@@ -63,43 +63,46 @@ TABLE2: Mapping[str, Mapping[str, Training]] = {
         "LR": Training(policy=_64, lfm=_256, idm=_50, algorithm="PPO"),
     },
 }
-"""Table 2: robot → method → networks and training algorithm."""
+"""Table 2: robot → method → networks and training algorithm.
+
+HER_SP is the paper's HER-Sparse (HER-Sp), HER_DE its HER-Dense (HER-De).
+"""
 
 INTERACTIONS = {"humanoid": 15_000_000, "minitaur": 4_000_000, "ant": 2_000_000}
-"""Table 2: robot → environment interactions, of every method."""
+"""Table 2: robot → environment interactions of each method."""
 
 LEARNED_BEFORE = {"humanoid": 5_000_000}
-"""A.1.2: robot → interactions after which its policy is frozen. The record is what follows."""
+"""A.1.2: robot → interactions after which its policy is frozen. The record starts there."""
 
 FRACTION = {"RS": 1.0, "RL": 1.0, "GE": 0.5, "LR": 0.5}
-"""A.1.2: method → the fraction of the record, from its start, that it learns from."""
+"""A.1.2: method → fraction of the record, from its start, that the method learns from."""
 
 LATENT_SIZE = {"humanoid": 50, "minitaur": 10, "ant": 10}
-"""A.1.2: robot → k."""
+"""A.1.2: robot → k (Eq. 3)."""
 
 LATENT_WEIGHT = 0.25
-"""A.1.2: λ."""
+"""A.1.2: λ (Eq. 7)."""
 
 LEARNING_RATE = 1e-3
-"""A.1.2: of Adam."""
+"""A.1.2: learning rate of Adam."""
 
 BATCH_SIZE = 512
-"""A.1.2: samples of a minibatch."""
+"""A.1.2: samples per minibatch."""
 
 TARGET_DISTANCE = {"humanoid": (2.0, 5.0), "minitaur": (1.5, 2.5), "ant": (2.0, 5.0)}
-"""A.1.3: robot → least and greatest distance of a target from the start, metres."""
+"""A.1.3: robot → smallest and largest distance from the start to a target, metres."""
 
 TARGET_BEARING = math.pi / 4
 """A.1.3: targets lie within ± this of the heading, radians."""
 
 MAX_STEPS = 1000
-"""A.1.3: control steps of an episode."""
+"""A.1.3: maximum number of environment steps of an episode."""
 
 TEST_SEEDS = 10
-"""A.1.3."""
+"""A.1.3: number of test seeds."""
 
 TEST_EPISODES = 1000
-"""A.1.3: of each test seed."""
+"""A.1.3: episodes per test seed."""
 
 TABLE1: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "humanoid": {
@@ -133,4 +136,4 @@ TABLE1: Mapping[str, Mapping[str, tuple[float, float]]] = {
 """Table 1: robot → method → (mean, standard deviation) of the closest distance, metres."""
 
 METHOD = "LR"
-"""The paper's own method, which is compared with every other."""
+"""The paper's own method; the report compares it with every other."""

@@ -1,4 +1,4 @@
-"""A record's actions replayed from turned starts (𝒢, Def. 4): its blocks, and their program."""
+"""Physics of 𝒢 (Def. 4): cut a record into blocks, and replay their actions from rotated starts."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from genidm.rollout import Move, rollout
 
 
 class RotatedReplay(flax.struct.PyTreeNode):
-    """What 𝒢 saw: C turned copies of a record of T steps of B lanes.
+    """𝒢(E): C rotated copies of a record of T steps and B lanes.
 
     Attributes:
-      s: ŝ `[C, T, B, S]`.
-      o: ô `[C, T, B, 3]`.
-      o_next: `[C, T, B, 3]`, replayed position after the step.
-      yaw: `[C, T, B]`, radians, by which the step is turned.
-      start: `[T, B]` int32, the step at which the robot was last placed.
-      valid: `[C, T, B]` bool, False once the physics diverged.
+      s: ŝ `[C, T, B, S]`, states.
+      o: ô `[C, T, B, 3]`, positions before the step, metres.
+      o_next: `[C, T, B, 3]`, replayed positions after the step, metres.
+      yaw: `[C, T, B]`, radians, rotation of the step.
+      start: `[T, B]` int32, step of the last placement on the record.
+      valid: `[C, T, B]` bool, False from a divergence, or an invalid recorded step, to the
+        next placement.
     """
 
     s: Any
@@ -41,13 +42,13 @@ class RotatedReplay(flax.struct.PyTreeNode):
     valid: Any
 
     def save(self, path: Path) -> None:
-        """Writes the replay as a directory of arrays, without pickle."""
+        """Write the replay as a directory of arrays, without pickle."""
         tree = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         files.save_arrays(path, tree, {}, overwrite=True)
 
     @classmethod
     def load(cls, path: Path) -> RotatedReplay:
-        """A replay that `save` wrote; raises BadInput if it is corrupt."""
+        """Load a replay that `save` wrote; raises BadInput if it is corrupt."""
         return cls(**files.load_arrays(path)[0])
 
 
@@ -55,27 +56,27 @@ Block = dict[str, Any]
 
 
 class Blocks:
-    """A record cut into blocks `[H, lanes]` of equal size, and put together again.
+    """A record, cut into blocks `[H, lanes]` of equal size.
 
-    Each column of a block is a segment, and blocks are independent; or, where whole episodes
-    are replayed, the columns are the record's lanes, and blocks follow one another.
+    By default each column of a block is a segment, and blocks are independent. With `follow`,
+    the columns are the record's lanes, and each block continues the block before it.
     Iterating gives the blocks, trees of arrays on the host.
 
     Args:
       experience: E, `[T, B, ...]`, with its physics.
-      length: steps of a block, H.
-      lanes: segments replayed at once.
-      among: devices that share a block's lanes evenly.
+      length: H, steps of a block.
+      lanes: segments to replay at once.
+      among: number of devices that share a block's lanes evenly.
       follow: replay whole episodes.
 
     Attributes:
       placed: `[T, B]` bool, where the robot is placed on the record.
-      start: `[T, B]` int32, for each step that of the last placement.
-      length: steps of a block, H.
+      start: `[T, B]` int32, step of the last placement.
+      length: H, steps of a block.
       width: lanes of a block.
-      count: columns of the record in all blocks.
-      stride: columns that a block has of its own; the rest of its lanes are padding.
-      follow: whether blocks follow one another.
+      count: columns of all blocks together, without padding.
+      stride: columns of a block without padding.
+      follow: whether each block continues the block before it.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Blocks:
         self.columns = jax.tree.map(lambda x: self._cut(np.asarray(x)), source)
 
     def _cut(self, x: np.ndarray) -> np.ndarray:
-        """`[T, B, ...]` → `[H, blocks in time × B, ...]`, the last block padded."""
+        """Reshape `[T, B, ...]` to `[H, blocks in time × B, ...]`, with the last block padded."""
         pad = self.shape[0] * self.length - self.steps
         x = np.concatenate([x, x[-1:].repeat(pad, axis=0)]) if pad else x
         x = x.reshape(self.shape[0], self.length, *x.shape[1:]).swapaxes(0, 1)
@@ -113,20 +114,20 @@ class Blocks:
 
     def _pad(self, begin: int, end: int, columns: np.ndarray) -> np.ndarray:
         x = columns[:, begin:end]
-        short = self.width - x.shape[1]
-        return np.concatenate([x, x[:, -1:].repeat(short, axis=1)], axis=1) if short else x
+        missing = self.width - x.shape[1]
+        return np.concatenate([x, x[:, -1:].repeat(missing, axis=1)], axis=1) if missing else x
 
     @property
     def total(self) -> int:
-        """Steps in all blocks, the padding counted."""
+        """Steps in all blocks, with padding."""
         return -(-self.count // self.stride) * self.length * self.width
 
     def example(self, key: jax.Array) -> tuple[jax.Array, Block]:
-        """Arguments of the first call, to compile for."""
+        """Keys and the first block, whose shapes the program is compiled for."""
         return jax.random.split(key, self.width), next(iter(self))
 
     def gather(self, outputs: list[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
-        """Outputs of all blocks as arrays `[T, B, ...]`."""
+        """Join the outputs of all blocks to arrays `[T, B, ...]`."""
 
         def join(*parts: np.ndarray) -> np.ndarray:
             x = np.concatenate([p[:, : self.stride] for p in parts], axis=1)[:, : self.count]
@@ -137,7 +138,7 @@ class Blocks:
 
 
 class Cursor(flax.struct.PyTreeNode):
-    """Robots in the middle of a replay, and the yaw that each is turned by."""
+    """State of a replay between two steps: the robots, and the yaw of each."""
 
     robots: State
     yaw: jax.Array
@@ -149,9 +150,9 @@ class Runner:
     """The compiled replay of one block, its lanes sharded over the mesh.
 
     Args:
-      robot: whose record is replayed.
+      robot: robot of the record.
       mesh: devices that share the lanes.
-      example: keys and a block of the shapes to compile for (`Blocks.example`).
+      example: keys and a block with the shapes of the program (`Blocks.example`).
 
     Attributes:
       program: the compiled (cursor, block on the devices) → (cursor, outputs on the
@@ -166,11 +167,11 @@ class Runner:
         self.program = compile_ahead("generalize", jax.jit(sharded), cursor, self.put(block))
 
     def put(self, block: Block) -> Block:
-        """A block on the devices."""
+        """Copy a block to the devices."""
         return devices.put(block, self.mesh, axis=1)
 
     def start(self, keys: jax.Array, block: Block) -> Cursor:
-        """A cursor for a block, with keys `[lanes]`; its robots are placed before they step."""
+        """Make a cursor for a block, with keys `[lanes]`; the first step places its robots."""
         yaw = jnp.zeros(keys.shape, jnp.float32)
         first = jax.tree.map(lambda x: x[0], block["physics"])
         shapes = jax.eval_shape(self.robot.set_state, first, yaw)
@@ -178,12 +179,12 @@ class Runner:
         return devices.put(Cursor(robots, yaw, yaw == 0, keys), self.mesh)
 
     def over(self, blocks: Blocks, key: jax.Array, bar: Progress) -> list[tuple[np.ndarray, ...]]:
-        """Outputs of all blocks, on the host; where blocks follow one another, robots go on."""
+        """Replay all blocks, and return their outputs on the host."""
         outputs: list[tuple[np.ndarray, ...]] = []
         cursor = None
         for i, block in enumerate(blocks):
             if cursor is None or not blocks.follow:
-                # A column's key is its own, however wide the blocks are.
+                # One key per column, so that the width of a block does not change the result.
                 columns = i * blocks.width + np.arange(blocks.width)
                 keys = jax.vmap(jax.random.fold_in, (None, 0))(key, columns)
                 cursor = self.start(keys, block)
@@ -196,12 +197,12 @@ class Runner:
         return rollout(self.robot, self._act, self._watch, cursor, block)
 
     def _act(self, cursor: Cursor, row: Block) -> tuple[State, jax.Array, tuple[Any, ...]]:
-        """B robots, placed on the record where it says so, and the record's actions."""
+        """Place the robots on the record where `placed` is True; return them and the actions."""
         placed = row["placed"]
         keys, yaw = _draw_yaw(cursor.keys)
         yaw = jnp.where(placed, yaw, cursor.yaw)
         on_record = self.robot.set_state(row["physics"], yaw)
-        # The record knows readings that `set_state` cannot (contact): turned, they are exact.
+        # `set_state` cannot compute contact readings; those of the record, rotated, are exact.
         on_record = on_record.replace(observation=self.robot.observation.rotate(row["s"], yaw))
         usable = (placed | cursor.valid) & row["valid"]
         return select(placed, on_record, cursor.robots), row["a"], (keys, yaw, usable)

@@ -319,7 +319,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
     def _fitted(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
-        record = self.experience().first_fraction(m.fraction)
+        record = self.experience().first_fraction(m.fraction).prepared(self.robot)
         samples = pairs(
             self.robot, record, self.replay(record), goal_horizon=m.goal_horizon, mirror=m.mirror
         )
