@@ -1,4 +1,4 @@
-# `make` lists what can be made. Everything runs in .venv, which is made first.
+# `make` lists the targets. All of them run in .venv, which is made first.
 
 PYTHON ?= python3
 EXTRAS ?= dev
@@ -14,13 +14,13 @@ NAME_ANOTHER = name one of these, as in: make $(or $(MAKECMDGOALS),.venv) PYTHON
 .DELETE_ON_ERROR:
 .PHONY: help .venv demo results gpu gpu-wheels check format test test-all clean
 
-help:  ## this list
+help:  ## print this list
 	@sed -nE 's/^([.a-z-]+):.*## /  make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 18
-	@echo "PYTHON=python3.12 names the Python of a new .venv; EXTRAS=dev,notebooks what goes into it."
+	@echo "PYTHON=python3.12 chooses the Python of a new .venv; EXTRAS=dev,notebooks its extras."
 
-.venv: $(STAMP)  ## the virtual environment, from the versions in constraints.txt
+.venv: $(STAMP)  ## the virtual environment, with the versions of constraints.txt
 
-# A .venv that works is kept, whichever Python made it: `make clean` first to change that.
+# A working .venv is kept, whatever PYTHON says: to change its Python, `make clean` first.
 $(STAMP): pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { \
 	  echo "genidm needs Python 3.11, 3.12 or 3.13, and there is no '$(PYTHON)': $(NAME_ANOTHER)" >&2; exit 1; }
@@ -33,30 +33,31 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 	@echo "Installed. For python to mean this one, here: source $(VENV)/bin/activate"
 
-demo: $(STAMP)  ## the Ant from nothing to a table, at small scale: random sampling, then ours
+demo: $(STAMP)  ## RS and LR on the Ant at small scale, from nothing to the table
 	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --run-dir runs/demo
 
-# In a directory of its own, where a method has one run. Days on two cores; killed, it goes on.
-results: $(STAMP)  ## every table, figure and number in experiments/results anew, in RESULTS (docs/runs.md)
+# RESULTS is a directory of its own, so that LR-0-* matches one run. It takes days on two cores; if
+# stopped, the same command resumes. The last command needs EXTRAS=dev,benchmark.
+results: $(STAMP)  ## make everything in experiments/results again, with runs in RESULTS (docs/runs.md)
 	@set -e; \
 	for robot in ant humanoid minitaur; do \
-	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --out $(RESULTS) \
+	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --run-dir $(RESULTS) \
 	    --report-dir experiments/results; \
 	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-* $(RESULTS)/$$robot/GE-0-* \
 	    $(RESULTS)/$$robot/VGCP-0-* $(RESULTS)/$$robot/HF-0-* --goal-radius 1 --out experiments/results; \
 	  $(BIN)/python -m experiments.benchmark --robot $$robot; \
 	done; \
-	$(BIN)/python -m experiments.humanoid_world --out $(RESULTS) --report-dir experiments/results; \
-	$(BIN)/python -m experiments.latent_size --out $(RESULTS) --report-dir experiments/results; \
+	$(BIN)/python -m experiments.humanoid_world --run-dir $(RESULTS) --report-dir experiments/results; \
+	$(BIN)/python -m experiments.latent_size --run-dir $(RESULTS) --report-dir experiments/results; \
 	$(BIN)/python -m experiments.physics; \
 	$(BIN)/python -m experiments.physics --robot humanoid; \
 	$(BIN)/python -m experiments.minitaur_physics; \
 	$(BIN)/python -m experiments.witness
 
-gpu: $(STAMP)  ## try, measure and use a GPU for MINUTES=9 (docs/gpu.md; EXTRAS=dev,cuda)
+gpu: $(STAMP)  ## try, measure and use a GPU for MINUTES=9 minutes (docs/gpu.md; EXTRAS=dev,cuda)
 	$(BIN)/python -m experiments.gpu --minutes $(MINUTES)
 
-gpu-wheels: $(STAMP)  ## what `make gpu` needs on a machine without a network, into .whl
+gpu-wheels: $(STAMP)  ## the wheels that `make gpu` needs on a machine without a network, in .whl
 	bash experiments/gpu_device.sh prepare
 
 check: $(STAMP)  ## format, lint and types
@@ -64,15 +65,15 @@ check: $(STAMP)  ## format, lint and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy genidm experiments
 
-format: $(STAMP)  ## mend what the linter can, and bring every file into its format
+format: $(STAMP)  ## fix what the linter can fix, and format every file
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
-# Most of a test's time is compiling, which uses one core. Files stay whole: their tests share programs.
+# A test mostly compiles, on one core. One worker per file: its tests share compiled programs.
 test: $(STAMP)  ## the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist loadfile
 
-test-all: $(STAMP)  ## the slow tests too, compiled as users' programs are
+test-all: $(STAMP)  ## all tests, with the compiler settings that users have
 	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 clean:  ## remove .venv, caches and build outputs; runs/ stays
