@@ -83,14 +83,14 @@ def uninterrupted() -> Iterator[None]:
         before(*came[0])
 
 
-def _scratch(path: Path, use: str) -> Path:
+def scratch_path(path: Path, use: str) -> Path:
     """A new temporary name beside `path`, for "new", "old" or "gone"; deletes abandoned ones."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for left in path.parent.glob(f".*{_SCRATCH}"):
         name, old, _ = left.name[1:].rpartition(".old.")
         only_version = old and not left.with_name(name).exists()
         if _abandoned(left) and not only_version:
-            _delete(left)
+            delete(left)
     token = secrets.token_hex(4)
     return path.with_name(f".{path.name}.{use}.{_here()}.{os.getpid()}.{token}{_SCRATCH}")
 
@@ -123,7 +123,8 @@ def _alive(process: int) -> bool:
     return True
 
 
-def _delete(path: Path) -> None:
+def delete(path: Path) -> None:
+    """Deletes a file or a directory, if it is there."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -146,7 +147,7 @@ def remove(path: Path) -> None:
       OSError: it cannot be removed; wrap the call in `disk` for a BadInput.
     """
     if path.exists():
-        _delete(path.rename(_scratch(path, "gone")))
+        delete(path.rename(scratch_path(path, "gone")))
 
 
 def _sync(path: Path) -> None:
@@ -166,14 +167,14 @@ def save_bytes(path: Path | str, content: bytes) -> None:
     """Writes a file."""
     path = Path(path)
     with disk(path):
-        scratch = _scratch(path, "new")
+        scratch = scratch_path(path, "new")
         try:
             scratch.write_bytes(content)
             _sync(scratch)
             os.replace(scratch, path)
             _sync(path.parent)
         finally:
-            _delete(scratch)
+            delete(scratch)
 
 
 def save_json(path: Path | str, obj: Any) -> None:
@@ -214,11 +215,11 @@ def check_writable(path: Path | str, directory: bool = False) -> None:
             there, missing = there.parent, there.name
         if not there.is_dir():
             raise BadInput(f"cannot use {path}: {there} is not a directory")
-        probe = _scratch(there / missing, "new")
+        probe = scratch_path(there / missing, "new")
         try:
             probe.touch(exist_ok=False)
         finally:
-            _delete(probe)
+            delete(probe)
 
 
 @contextlib.contextmanager
@@ -235,7 +236,7 @@ def building(path: Path) -> Iterator[Path]:
     with disk(path):
         _recover(path)
         _only_ours(path)
-        scratch = _scratch(path, "new")
+        scratch = scratch_path(path, "new")
         try:
             scratch.mkdir()
             yield scratch
@@ -244,17 +245,17 @@ def building(path: Path) -> Iterator[Path]:
                 raise BadInput(f"{scratch} has vanished while it was being written")
             for entry in entries:
                 _sync(entry)
-            files = {str(p.relative_to(scratch)): _measure(p) for p in entries if p.is_file()}
+            files = {str(p.relative_to(scratch)): measure(p) for p in entries if p.is_file()}
             save_json(scratch / MANIFEST, files)
             _install(scratch, path)
         finally:
-            _delete(scratch)
+            delete(scratch)
 
 
 def _install(scratch: Path, path: Path) -> None:
     """Replaces `path` by `scratch`: moves the old directory away, and deletes it afterwards."""
     if path.exists():
-        old = path.rename(_scratch(path, "old"))
+        old = path.rename(scratch_path(path, "old"))
         try:
             scratch.rename(path)
         except OSError:
@@ -264,7 +265,7 @@ def _install(scratch: Path, path: Path) -> None:
         scratch.rename(path)
     _sync(path.parent)
     for old in path.parent.glob(f".{glob.escape(path.name)}{_OLD}"):
-        _delete(old)
+        delete(old)
 
 
 def _only_ours(path: Path) -> None:
@@ -290,7 +291,8 @@ def _manifest(directory: Path) -> dict[str, list[int]]:
     return files
 
 
-def _measure(file: Path) -> list[int]:
+def measure(file: Path) -> list[int]:
+    """Size in bytes and crc32 of a file, as a manifest lists them."""
     size = crc = 0
     with file.open("rb") as f:
         while block := f.read(1 << 20):
@@ -306,10 +308,10 @@ def verify(directory: Path | str) -> list[str]:
         if not directory.exists():
             raise Corrupt(f"{directory} is missing")
         files = _manifest(directory)
-        for name, measure in files.items():
+        for name, listed in files.items():
             if not (directory / name).is_file():
                 raise Corrupt(f"{directory} is corrupt: {name} is missing")
-            if _measure(directory / name) != measure:
+            if measure(directory / name) != listed:
                 raise Corrupt(f"{directory} is corrupt: {name} was cut short or changed")
         return list(files)
 

@@ -44,14 +44,15 @@ UNRELATED = frozenset(
 _PACKAGE = Path(__file__).resolve().parent
 
 
-def code_of(*roots: Any) -> dict[str, str]:
+def code_of(*roots: Any, alone: Iterable[str] = ()) -> dict[str, str]:
     """The modules that a result depends on: name → ten hex digits of its code.
 
     Args:
       roots: names of modules, or objects. An object stands for the modules that define its
         class and the classes of all dataclasses in it.
+      alone: names of modules that count without what they import.
     """
-    found: dict[str, str] = {}
+    found = {name: _digest(name) for name in alone}
     todo = {name for root in roots for name in _modules_of(root)}
     while todo:
         name = todo.pop()

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from genidm.checks import check, count, number, positive
+from genidm.paper.protocol import TARGET_BEARING
 from genidm.robots.base import Robot, State
 from genidm.symmetry import horizontal_norm
 
@@ -222,7 +223,7 @@ class GoToGoal:
     reward: ProgressReward | Sparse | Dense = ProgressReward()
     episode_steps: int = 300
     start_yaw: float = math.pi
-    bearing: float = math.pi / 4
+    bearing: float = TARGET_BEARING
     goal_radius: float = 0.1
     goal_conditioned: ClassVar[bool] = True
 

@@ -153,7 +153,7 @@ def test_products_are_those_of_the_networks(ant):
         networks = Architecture(size, settings.idm, settings.lfm, settings.latent_size)
         params = networks.init(jax.random.key(0), ant.observation.size)
         matrices = [x.shape for x in jax.tree.leaves(params) if x.ndim == 2]
-        psi, phi = fitting._products(ant, settings)
+        psi, phi = fitting.products(ant, settings)
         assert sorted(psi + phi) == sorted(matrices)
 
 

@@ -209,7 +209,7 @@ def test_killed_at_any_moment_old_or_new_is_there(tmp_path: Path, monkeypatch) -
             m.setattr(os, "fsync", dying(os.fsync, at))
             m.setattr(os, "replace", dying(os.replace, at))
             m.setattr(Path, "rename", dying(Path.rename, at))
-            m.setattr(files, "_delete", dying(files._delete, at))
+            m.setattr(files, "delete", dying(files.delete, at))
             try:
                 checkpoints.save(2, {"a": np.full(3, 2.0), "n": 2})
             except Killed:

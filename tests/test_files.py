@@ -105,10 +105,10 @@ def test_a_manifest_of_another_program_makes_a_directory_not_ours(
 
 def test_an_old_version_comes_back_where_a_kill_left_no_new_one(tmp_path: Path) -> None:
     save_arrays(tmp_path / "x", TREE, 1)
-    (tmp_path / "x").rename(files._scratch(tmp_path / "x", "old"))
+    (tmp_path / "x").rename(files.scratch_path(tmp_path / "x", "old"))
     save_arrays(tmp_path / "y", TREE, 2)  # tidies up, but not the only version of x
     assert load_arrays(tmp_path / "x")[1] == 1
-    (tmp_path / "x").rename(files._scratch(tmp_path / "x", "old"))
+    (tmp_path / "x").rename(files.scratch_path(tmp_path / "x", "old"))
     with pytest.raises(BadInput, match="exists already"):
         save_arrays(tmp_path / "x", TREE, 3)
     assert load_arrays(tmp_path / "x")[1] == 1
@@ -119,7 +119,7 @@ def test_what_another_container_is_writing_stays(tmp_path: Path, monkeypatch) ->
     dead = 2**22 + 1
     monkeypatch.setattr(os, "getpid", lambda: dead)
     monkeypatch.setattr(files, "_here", lambda: "elsewhere")
-    theirs = files._scratch(tmp_path / "x", "new")
+    theirs = files.scratch_path(tmp_path / "x", "new")
     monkeypatch.undo()
     theirs.mkdir()
     save_arrays(tmp_path / "y", TREE, 1)
@@ -157,7 +157,7 @@ def test_pickle_is_not_loaded_even_with_a_true_manifest(tmp_path: Path) -> None:
     file = tmp_path / "x" / "a.npy"
     np.save(file, np.array([print], object), allow_pickle=True)
     manifest = files.load_json(tmp_path / "x" / "manifest.json")
-    files.save_json(tmp_path / "x" / "manifest.json", {**manifest, "a.npy": files._measure(file)})
+    files.save_json(tmp_path / "x" / "manifest.json", {**manifest, "a.npy": files.measure(file)})
     for mmap in (False, True):
         with pytest.raises(BadInput, match="cannot be read"):
             load_arrays(tmp_path / "x", mmap=mmap)
@@ -175,7 +175,7 @@ def believed(directory: Path, name: str) -> None:
     """Makes the manifest say that a file is as it should be."""
     manifest = files.load_json(directory / "manifest.json")
     files.save_json(
-        directory / "manifest.json", {**manifest, name: files._measure(directory / name)}
+        directory / "manifest.json", {**manifest, name: files.measure(directory / name)}
     )
 
 

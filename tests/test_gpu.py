@@ -29,7 +29,7 @@ from genidm.runs.command import run_cli
 CALL = {"minutes": 1, "environment": {"versions": {}, "hardware": "a machine", "commit": None}}
 
 
-def reported(this, scenarios, options) -> Path:
+def reported(this, scenarios, options, own=()) -> Path:
     """Stands for a report, whose figures take longer than all else."""
     place = this.root / f"report-{this.scale.name}"
     place.mkdir(exist_ok=True)

@@ -294,7 +294,7 @@ def spoil(directory: Path, name: str, change) -> None:
     file = directory / name
     np.save(file, change(np.load(file)))
     manifest = files.load_json(directory / "manifest.json")
-    files.save_json(directory / "manifest.json", manifest | {name: files._measure(file)})
+    files.save_json(directory / "manifest.json", manifest | {name: files.measure(file)})
 
 
 def foreign(directory: Path, **changes: Any) -> None:
@@ -302,7 +302,7 @@ def foreign(directory: Path, **changes: Any) -> None:
     meta = files.load_json(directory / "meta.json") | changes
     files.save_json(directory / "meta.json", meta)
     manifest = files.load_json(directory / "manifest.json")
-    measured = files._measure(directory / "meta.json")
+    measured = files.measure(directory / "meta.json")
     files.save_json(directory / "manifest.json", manifest | {"meta.json": measured})
 
 

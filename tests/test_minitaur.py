@@ -121,10 +121,10 @@ def test_a_motor_that_is_hot_for_a_second_is_off_for_good(simulation: Simulation
     simulation.set_state(row)
     strong = np.array([0, 0, 0, 0, -1, -1, -1, -1.0])
     given = []
-    push = simulation._push
-    simulation._push = lambda torques: (given.append(np.abs(torques)), push(torques))  # type: ignore
+    push = simulation.push
+    simulation.push = lambda torques: (given.append(np.abs(torques)), push(torques))  # type: ignore
     simulation.step(strong)
-    simulation._push = push  # type: ignore[method-assign]
+    simulation.push = push  # type: ignore[method-assign]
     assert given[0][0] > HOT and not given[1][0]  # the last of its second; one too many
     assert not np.array(given)[:, 7].any()
     assert np.array(given)[:, 1:7].all()

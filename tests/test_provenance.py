@@ -19,6 +19,8 @@ from genidm.agents.sac import SAC
 from genidm.paper import methods
 from genidm.provenance import changed, code_digest, code_of
 from genidm.robots import Ant
+from genidm.runs.cell import make_run
+from genidm.runs.resolve import Options
 
 ROBOT = Ant(engine="mujoco")
 COLLECT = "genidm.agents.collect"
@@ -47,6 +49,16 @@ def test_code_is_what_is_imported_one_through_another() -> None:
 def test_settings_bring_the_modules_that_define_them(settings, there, absent) -> None:
     code = code_of(settings)
     assert there in code and absent not in code
+
+
+def test_a_stage_depends_on_its_own_code(tmp_path: Path) -> None:
+    run = make_run(ROBOT, methods.LR, Options(run_dir=tmp_path, scale="0.001"))
+    collected, fitted = run.experience_stage.code, run.controller_stage.code
+    assert {"genidm.agents.ppo", "genidm.runs.run", "genidm.robots.ant"} <= collected.keys()
+    others = {"genidm.paper.fit", "genidm.agents.sac", "genidm.evaluation.evaluate"}
+    assert not others & collected.keys()
+    assert {"genidm.paper.fit", "genidm.paper.idm", "genidm.runs.run"} <= fitted.keys()
+    assert not {"genidm.agents.ppo", "genidm.evaluation.evaluate"} & fitted.keys()
 
 
 def test_a_subclass_elsewhere_brings_its_own_module_and_its_base() -> None:

@@ -151,7 +151,7 @@ def test_a_part_made_anew_is_not_taken_for_the_one_before(tmp_path: Path) -> Non
     remembering = Remembering(Checkpoints(tmp_path))
     assert remembering.latest(LIKE)[0] == 1
     flip(tmp_path / "step_000000002" / "leaves.json")  # it was only for once, as disks have it
-    remembering._append(other["learner"]["buffer"])  # killed before the checkpoint
+    remembering.append(other["learner"]["buffer"])  # killed before the checkpoint
     got = found(tmp_path)
     assert got[0] == 1
     same(got[1], tree(1))
@@ -193,7 +193,7 @@ def test_killed_at_any_moment_old_or_new_is_there(tmp_path: Path, monkeypatch) -
             m.setattr(os, "fsync", dying(os.fsync, at))
             m.setattr(os, "replace", dying(os.replace, at))
             m.setattr(Path, "rename", dying(Path.rename, at))
-            m.setattr(files, "_delete", dying(files._delete, at))
+            m.setattr(files, "delete", dying(files.delete, at))
             with contextlib.suppress(Killed):
                 remembering.save(8, tree(8))
                 break

@@ -75,7 +75,7 @@ def test_results_have_the_schema(rows):
     assert made | {"methods", "paired"} == set(r)
     assert (r["robot"], r["scale"], r["other_code"]) == ("ant", "paper", {})
     for name, method in r["methods"].items():
-        several = {"collecting_seeds"} if name in ("GE", "LR") else set()
+        several = {"training_seeds"} if name in ("GE", "LR") else set()
         assert set(method) == KEYS | EXTRA | several
         assert set(method["success"]) == {"0.25", "0.5", "1.0"}
         low, high = method["ci95"]
@@ -92,8 +92,8 @@ def test_results_are_the_episodes_numbers(rows):
     method, episodes = document(rows)["methods"]["GE"], rows[2].episodes
     assert method["mean"] == pytest.approx(episodes.closest.mean(), abs=1e-6)
     assert method["std"] == pytest.approx(episodes.closest.std(), abs=1e-6)
-    means = [e.closest.mean() for e in rows[2].collecting_seeds.values()]
-    over = method["collecting_seeds"]
+    means = [e.closest.mean() for e in rows[2].training_seeds.values()]
+    over = method["training_seeds"]
     assert (over["seeds"], over["episodes"]) == ([0, 1, 2], [[4, 50]] * 3)
     assert over["means"] == pytest.approx(means, abs=1e-6)
     assert over["std"] == pytest.approx(np.std(means, ddof=1), abs=1e-6)
@@ -103,9 +103,9 @@ def test_results_are_the_episodes_numbers(rows):
 def test_what_is_not_known_of_a_row_is_not_in_its_results():
     known = document([row("LR", invariance=0.123456)])["methods"]["LR"]
     assert (known["training_seed"], known["invariance"]) == (0, 0.123)
-    assert "collecting_seeds" not in known
-    unknown = document([row("LR", collecting_seeds={})])["methods"]["LR"]
-    assert not unknown.keys() & {"training_seed", "collecting_seeds", "invariance"}
+    assert "training_seeds" not in known
+    unknown = document([row("LR", training_seeds={})])["methods"]["LR"]
+    assert not unknown.keys() & {"training_seed", "training_seeds", "invariance"}
 
 
 def test_neighbours_are_paired_and_the_papers_method_with_the_rest(rows):
@@ -122,10 +122,10 @@ def test_neighbours_are_paired_and_the_papers_method_with_the_rest(rows):
     expected = stats.paired(rows[3].episodes, rows[2].episodes)
     assert paired["LR-GE"]["difference"] == pytest.approx(expected["difference"], abs=1e-6)
     assert paired["LR-GE"]["difference"] < 0
-    assert len(paired["LR-GE"]["collecting_seeds"]["means"]) == 3
-    assert paired["LR-GE"]["collecting_seeds"]["seeds"] == [0, 1, 2]
-    assert paired["LR-GE"]["collecting_seeds"]["improvement"] == 1.0
-    assert "collecting_seeds" not in paired["HF-LR"]
+    assert len(paired["LR-GE"]["training_seeds"]["means"]) == 3
+    assert paired["LR-GE"]["training_seeds"]["seeds"] == [0, 1, 2]
+    assert paired["LR-GE"]["training_seeds"]["improvement"] == 1.0
+    assert "training_seeds" not in paired["HF-LR"]
     assert document(rows[:1])["paired"] == {}
 
 
@@ -133,9 +133,9 @@ def test_runs_are_paired_by_their_training_seed_on_what_both_saw():
     lr, ge = {n: outcome(1.0, n) for n in (0, 1, 2)}, {n: outcome(1.5, n) for n in (0, 2, 3)}
     ge[2] = outcome(1.5, 2, seeds=4, episodes=30)
     lr[2] = dataclasses.replace(lr[2], closest=lr[2].closest + 1)
-    these = [row("GE", episodes=ge[0], collecting_seeds=ge)]
-    these.append(row("LR", episodes=lr[0], collecting_seeds=lr))
-    over = document(these)["paired"]["LR-GE"]["collecting_seeds"]
+    these = [row("GE", episodes=ge[0], training_seeds=ge)]
+    these.append(row("LR", episodes=lr[0], training_seeds=lr))
+    over = document(these)["paired"]["LR-GE"]["training_seeds"]
     expected = [
         (lr[0].closest - ge[0].closest).mean(),
         (lr[2].closest[:, :30] - ge[2].closest).mean(),
@@ -170,9 +170,9 @@ def test_comparisons_have_no_columns_for_training_seeds_that_are_not_there():
 
 
 def test_half_a_training_seed_is_not_lost_in_rounding():
-    a = row("LR", 3, collecting_seeds={n: outcome(1.0, n) for n in range(3)})
+    a = row("LR", 3, training_seeds={n: outcome(1.0, n) for n in range(3)})
     means = {0: outcome(1.5, 0), 1: outcome(0.5, 1), 2: outcome(1.0, 2)}
-    r = document([row("GE", episodes=means[0], collecting_seeds=means), a])
+    r = document([row("GE", episodes=means[0], training_seeds=means), a])
     (line,) = [x for x in report.text(r).splitlines() if x.startswith("LR-GE")]
     assert line.endswith("1.5 of 3")
 
@@ -184,7 +184,7 @@ def test_the_notes_tell_which_numbers_are_over_which_seeds(rows):
     assert "seeds after the first: 4 × 50 test episodes" in notes and "GE 0." in notes
     only = report.text(document([row("LR")])).replace("\n", " ")
     assert "“Over seeds” uses" not in only
-    other = row("GE", collecting_seeds={5: outcome(1.0)})
+    other = row("GE", training_seeds={5: outcome(1.0)})
     assert "one training seed (GE 5, LR 0)" in report.text(document([other, row("LR")]))
 
 

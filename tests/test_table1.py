@@ -173,7 +173,7 @@ def test_a_whole_test_of_a_later_seed_stands_whoever_made_it(copy: Path) -> None
     with counted("run") as calls:
         run(Point(), METHODS, options(copy))
     assert not calls
-    over = results(copy)["methods"]["RS"]["collecting_seeds"]
+    over = results(copy)["methods"]["RS"]["training_seeds"]
     assert over["episodes"] == [[10, 2], [10, 2]]
     assert over["means"][1] == pytest.approx(Tested(whole.directory, {}).episodes.closest.mean())
 
@@ -212,7 +212,7 @@ def test_one_table_and_one_json_hold_all(finished: Path) -> None:
 
 def test_the_training_seeds_stand_beside(finished: Path) -> None:
     for method in results(finished)["methods"].values():
-        over = method["collecting_seeds"]
+        over = method["training_seeds"]
         assert method["training_seed"] == 0
         assert (over["seeds"], over["episodes"]) == ([0, 1], [[10, 2], [10, 1]])
         assert over["means"][0] == method["mean"] != over["means"][1]
@@ -230,9 +230,9 @@ def test_invariance_is_measured_on_one_record_for_all(finished: Path) -> None:
 
 def test_a_report_reads_and_computes_once_for_both_places(copy: Path, monkeypatch) -> None:
     read, made = Counter(), Counter()
-    load, angles = files.load_arrays, shown._angles
+    load, angles = files.load_arrays, shown.angles
     monkeypatch.setattr(files, "load_arrays", lambda p, **k: (read.update([p]), load(p, **k))[1])
-    monkeypatch.setattr(shown, "_angles", lambda *a: (made.update("a"), angles(*a))[1])
+    monkeypatch.setattr(shown, "angles", lambda *a: (made.update("a"), angles(*a))[1])
     shutil.rmtree(copy / "results")
     run(Point(), METHODS, options(copy))
     assert (copy / "results" / "point_0.25_paths.png").exists()

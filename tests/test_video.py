@@ -343,7 +343,7 @@ def test_a_gif_keeps_the_colours_of_little_things() -> None:
 
 def test_the_camera_keeps_the_robot_in_the_middle_and_its_goal_in_sight(made: Video) -> None:
     take = made.clips[0]
-    cameras = rendering._cameras(take, take.times, 1.0)
+    cameras = rendering.cameras(take, take.times, 1.0)
     ahead = np.radians([camera.azimuth for camera in cameras])
     way = (take.waypoints - take.position)[:, :2]
     angle = np.arctan2(way[:, 1], way[:, 0]) - ahead

@@ -68,7 +68,7 @@ def steered(robot: Robot, controller: Any) -> dict[str, Any]:
         "scenarios": tested_scenarios.digest(),
         "closest": np.asarray(outcome.closest).tolist(),
         "steps": np.asarray(outcome.steps).tolist(),
-        "way": np.asarray(traces[1].way[-1]).tolist(),
+        "way": np.asarray(traces[1].position[-1]).tolist(),
         "arrival": made.arrival.tolist(),
         "end": made.position[:, -1].tolist(),
     }

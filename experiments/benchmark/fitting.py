@@ -48,7 +48,7 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
     These are the products of the gradient of a network of the same shape without biases and
     nonlinearities. The weights change a little: else XLA would move the products out of the loop.
     """
-    psi, phi = _products(bench.robot, settings)
+    psi, phi = products(bench.robot, settings)
     keys = jax.random.split(jax.random.key(0), 3)
     weights = _weights(keys[0], psi), _weights(keys[1], phi)
     views = 2 if psi else 1
@@ -65,7 +65,7 @@ def multiplying(bench: Bench, *, settings: Fit) -> Probe:
     return Probe(timed(carried(program, weights), UPDATES), _networks(settings))
 
 
-def _products(robot: Robot, settings: Fit) -> tuple[list[Shape], list[Shape]]:
+def products(robot: Robot, settings: Fit) -> tuple[list[Shape], list[Shape]]:
     """Shapes of the matrices of ψ (empty if there is none) and of φ."""
     state, latent = robot.observation.size + 3, settings.latent_size
     psi = (state, *settings.lfm, latent) if latent else ()

@@ -27,10 +27,10 @@ class Remembering:
     def save(self, step: int, tree: Any) -> None:
         """See `Checkpoints.save`; of the buffer, write only the rows since the last checkpoint."""
         for buffer in buffers(tree):
-            self._append(buffer)
+            self.append(buffer)
         self.checkpoints.save(step, emptied(tree), self._parts)
 
-    def _append(self, buffer: Buffer) -> None:
+    def append(self, buffer: Buffer) -> None:
         written, max_replay_size = int(buffer.written), buffer.rows.last.shape[0]
         since = max(written - max_replay_size, _span(self._parts[-1])[1] if self._parts else 0)
         self._parts = [part for part in self._parts if _span(part)[1] > written - max_replay_size]

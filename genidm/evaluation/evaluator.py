@@ -21,6 +21,7 @@ from genidm import devices
 from genidm.checks import check, count, number
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
+from genidm.paper import protocol
 from genidm.progress import compile_ahead
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
@@ -111,7 +112,7 @@ class EvaluationSettings:
       chunk: steps per program call.
     """
 
-    max_steps: int = 1000
+    max_steps: int = protocol.MAX_STEPS
     goal_radius: float = 0.1
     num_envs: int = 512
     chunk: int = 50

@@ -9,6 +9,7 @@ import numpy as np
 from genidm import symmetry
 from genidm.evaluation.evaluate import ControllerFn
 from genidm.experience import Experience
+from genidm.paper.protocol import TARGET_BEARING
 from genidm.robots.base import Robot
 
 ANGLES = np.radians(np.arange(0, 181, 15))
@@ -67,7 +68,7 @@ def probes(
     valid = np.flatnonzero(record.valid)
     drawn = np.sort(rng.choice(valid, min(count, valid.size), replace=False))
     s, o = (jnp.asarray(x.reshape(-1, x.shape[-1])[drawn]) for x in (record.s, record.o))
-    bearing = rng.uniform(-np.pi / 4, np.pi / 4, drawn.size).astype(np.float32)
+    bearing = rng.uniform(-TARGET_BEARING, TARGET_BEARING, drawn.size).astype(np.float32)
     angle = robot.observation.yaw(s) + bearing
     horizontal = np.clip(FAR, *robot.target_distance) * jnp.stack(
         [jnp.cos(angle), jnp.sin(angle)], -1

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm.checks import check_value, count, seed
+from genidm.paper.protocol import TARGET_BEARING, TEST_EPISODES, TEST_SEEDS
 from genidm.robots.base import Robot
 from genidm.tasks import ahead
 
@@ -48,7 +49,7 @@ MOST_EPISODES = 10**6
 
 
 def scenarios(
-    robot: Robot, seeds: int = 10, episodes: int = 1000, first_seed: int = 0
+    robot: Robot, seeds: int = TEST_SEEDS, episodes: int = TEST_EPISODES, first_seed: int = 0
 ) -> Scenarios:
     """Make the paper's test (A.1.3): random heading, target 2–5 m away within ±45° of it.
 
@@ -83,7 +84,9 @@ def _scenarios(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenari
             start,
             jax.random.uniform(turn, (), jnp.float32, minval=-jnp.pi, maxval=jnp.pi),
             jax.random.uniform(far, (), jnp.float32, minval=low, maxval=high),
-            jax.random.uniform(side, (), jnp.float32, minval=-jnp.pi / 4, maxval=jnp.pi / 4),
+            jax.random.uniform(
+                side, (), jnp.float32, minval=-TARGET_BEARING, maxval=TARGET_BEARING
+            ),
         )
 
     grid = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
@@ -122,7 +125,7 @@ def fig8_scenarios(robot: Robot) -> Scenarios:
     """
     low, high = robot.target_distance
     far = jnp.linspace((low + high) / 2, high, FIG8_EPISODES, dtype=jnp.float32)
-    side = jnp.linspace(-jnp.pi / 4, jnp.pi / 4, FIG8_EPISODES, dtype=jnp.float32)
+    side = jnp.linspace(-TARGET_BEARING, TARGET_BEARING, FIG8_EPISODES, dtype=jnp.float32)
     shape = (2, FIG8_EPISODES)
     return toward(
         robot,

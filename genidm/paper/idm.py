@@ -20,16 +20,16 @@ class MLP(nn.Module):
     """A multilayer perceptron with ReLU and a linear output layer.
 
     Attributes:
-      policy_hidden_layer_sizes: widths of the hidden layers.
+      hidden_layer_sizes: widths of the hidden layers.
       outputs: width of the output.
     """
 
-    policy_hidden_layer_sizes: tuple[int, ...]
+    hidden_layer_sizes: tuple[int, ...]
     outputs: int
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        for width in self.policy_hidden_layer_sizes:
+        for width in self.hidden_layer_sizes:
             x = nn.relu(nn.Dense(width)(x))
         return nn.Dense(self.outputs)(x)
 

@@ -26,7 +26,7 @@ class Row:
       interactions: environment steps that were collected.
       replayed: environment steps that 𝒢 replayed (Def. 4).
       settings: settings of agent and fit; any value that JSON can hold.
-      collecting_seeds: training seed → test results of the run with that seed; the first is
+      training_seeds: training seed → test results of the run with that seed; the first is
         `episodes`. The seed determines experience, 𝒢 and fit. Empty if unknown.
       invariance: mean change of the action when robot and goal are rotated together
         (`genidm.evaluation.invariance`); None if not measured.
@@ -38,7 +38,7 @@ class Row:
     interactions: int
     replayed: int
     settings: dict[str, Any]
-    collecting_seeds: Mapping[int, Episodes] = dataclasses.field(default_factory=dict)
+    training_seeds: Mapping[int, Episodes] = dataclasses.field(default_factory=dict)
     invariance: float | None = None
     made: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
@@ -64,7 +64,7 @@ def results(
     Returns:
       robot, engine, scale, scenarios, and
       methods: name → `stats.summary`, interactions, replayed, settings, `made` (stage → origin)
-      and, if known, training_seed, invariance and collecting_seeds (several training seeds:
+      and, if known, training_seed, invariance and training_seeds (several training seeds:
       seeds, episodes per seed, `stats.spread`);
       paired: "LR-GE" → `stats.paired` of LR against GE and, if both have several training
       seeds in common, `stats.paired_spread` over these;
@@ -95,13 +95,13 @@ def _method(row: Row) -> dict[str, Any]:
         **jsonable(stats.summary(row.episodes), digits=6),
         "settings": jsonable(row.settings),
     }
-    runs = row.collecting_seeds
+    runs = row.training_seeds
     if runs:
         record["training_seed"] = next(iter(runs))
     if len(runs) > 1:
         sizes = [list(run.closest.shape) for run in runs.values()]
         spread = jsonable(stats.spread(list(runs.values())), digits=6)
-        record["collecting_seeds"] = {"seeds": list(runs), "episodes": sizes, **spread}
+        record["training_seeds"] = {"seeds": list(runs), "episodes": sizes, **spread}
     if row.invariance is not None:
         record["invariance"] = float(f"{row.invariance:.3g}")
     if row.made:
@@ -152,10 +152,10 @@ def _compared(rows: Sequence[Row]) -> Iterator[tuple[Row, Row]]:
 
 def _pair(a: Row, b: Row) -> dict[str, Any]:
     record = stats.paired(a.episodes, b.episodes)
-    both = [seed for seed in a.collecting_seeds if seed in b.collecting_seeds]
+    both = [seed for seed in a.training_seeds if seed in b.training_seeds]
     if len(both) > 1:
-        runs = ([row.collecting_seeds[seed] for seed in both] for row in (a, b))
-        record["collecting_seeds"] = {"seeds": both, **stats.paired_spread(*runs)}
+        runs = ([row.training_seeds[seed] for seed in both] for row in (a, b))
+        record["training_seeds"] = {"seeds": both, **stats.paired_spread(*runs)}
     plain: dict[str, Any] = jsonable(record, digits=6)
     return plain
 

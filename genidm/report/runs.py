@@ -92,7 +92,7 @@ class Runs:
             interactions=tests[0].summary["interactions"],
             replayed=tests[0].summary["replayed"],
             settings=tests[0].summary["settings"],
-            collecting_seeds={test.summary["seed"]: test.episodes for test in tests},
+            training_seeds={test.summary["seed"]: test.episodes for test in tests},
             invariance=invariance,
             made=tests[0].made,
         )

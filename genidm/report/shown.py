@@ -56,7 +56,7 @@ class Shown:
 
 def gather(runs: Runs) -> Shown:
     """Collects the data of all figures of a report."""
-    heading, bearing = _angles(runs.robot, runs.scenarios)
+    heading, bearing = angles(runs.robot, runs.scenarios)
     learned = {name: _metrics(tests[0].controller.parent) for name, tests in runs.found.items()}
     return Shown(
         closest={name: stats.masked(tests[0].episodes) for name, tests in runs.found.items()},
@@ -95,7 +95,7 @@ def _panels(runs: Runs) -> list[Panel]:
     ]
 
 
-def _angles(robot: Robot, scenarios: Scenarios) -> tuple[np.ndarray, np.ndarray]:
+def angles(robot: Robot, scenarios: Scenarios) -> tuple[np.ndarray, np.ndarray]:
     """Initial heading and the target's bearing from it, each `[seeds, episodes]`, radians."""
 
     def angles(keys: jax.Array, yaw: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:

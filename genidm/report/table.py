@@ -49,7 +49,7 @@ def _cells(results: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def _row(name: str, m: Mapping[str, Any], paper: tuple[float, float] | None) -> tuple[str, ...]:
     low, high = m["ci95"]
-    over = m.get("collecting_seeds")
+    over = m.get("training_seeds")
     steps = [_count(n) for n in (m["interactions"], m["replayed"]) if n]
     return (
         name,
@@ -96,7 +96,7 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
     ]
     if results.get("engine"):
         notes.append(f"Physics engine: {results['engine']}.")
-    several = {name: m["collecting_seeds"] for name, m in methods.items() if _several(m)}
+    several = {name: m["training_seeds"] for name, m in methods.items() if _several(m)}
     if several:
         notes.append(_over_seeds(several))
     invariance = [
@@ -171,7 +171,7 @@ def _over_seeds(several: Mapping[str, Any]) -> str:
 
 
 def _several(method: Mapping[str, Any]) -> bool:
-    return "collecting_seeds" in method
+    return "training_seeds" in method
 
 
 def _comparisons(results: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -194,7 +194,7 @@ def _comparison(name: str, pair: Mapping[str, Any]) -> tuple[str, ...]:
     this = (name, _signed(pair["difference"]), _bounds(pair["ci95"]), _percent(pair["improvement"]))
     if not _several(pair):
         return (*this, *[""] * (len(COMPARED) - BRIEF))
-    over = pair["collecting_seeds"]
+    over = pair["training_seeds"]
     count = sum(mean is not None for mean in over["means"])
     nearer = f"{round(2 * count * over['improvement']) / 2:g} of {count}" if count else "–"
     return (*this, _spread(over, "+"), _bounds(over["ci95"]), nearer)

@@ -299,10 +299,10 @@ class Simulation:
         given, self.torque = motor_torques(command, angle, rate)
         hotter = np.where(np.abs(given) > HOT, self.heat + 1, 0)
         self.heat = np.where(self.heat > PATIENT, self.heat, hotter)
-        self._push(np.where(self.heat > PATIENT, 0.0, given * DIRECTION))
+        self.push(np.where(self.heat > PATIENT, 0.0, given * DIRECTION))
         self.bullet.stepSimulation()
 
-    def _push(self, torques: np.ndarray) -> None:
+    def push(self, torques: np.ndarray) -> None:
         self.bullet.setJointMotorControlArray(
             self.body, self.motors, self.bullet.TORQUE_CONTROL, forces=torques.tolist()
         )

@@ -120,8 +120,8 @@ def who_set_what(
       up to three lines: settings that `resolve` chose, that the user set, and that differ from
       the paper.
     """
-    ours = isinstance(given, InverseDynamics) and given.name == method.name
-    papers = paper_settings(given) if ours else given
+    unnamed = given.name == method.name
+    papers = paper_settings(given) if isinstance(given, InverseDynamics) and unnamed else given
     lines = []
     for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),

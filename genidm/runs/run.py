@@ -111,7 +111,8 @@ class Run(abc.ABC, Generic[M]):
 
     def _stage(self, name: str, config: dict[str, Any], *code: Any) -> Stage:
         """The stage of a config; it depends on this module, the robot, its engine and `code`."""
-        made_by = code_of(__name__, self.robot, self.robot.engine, config, *code)
+        # This module imports all stages; a stage depends only on the code of its own.
+        made_by = code_of(self.robot, self.robot.engine, config, *code, alone=[__name__])
         config = {"robot": self.robot.settings, "seed": self.seed} | config
         return Stage.open(self.root, name, config, made_by, self.other_code)
 

@@ -134,8 +134,8 @@ def _clip(
 ) -> Iterator[np.ndarray]:
     data, poses = mujoco.MjData(eye.model), clip.at(eye.model, seconds)
     metres = size(eye.model, poses[0])
-    cameras = _cameras(clip, seconds, metres)
-    for pose, left, now, camera in zip(poses, clip.left(seconds), seconds, cameras, strict=True):
+    seen_by = cameras(clip, seconds, metres)
+    for pose, left, now, camera in zip(poses, clip.left(seconds), seconds, seen_by, strict=True):
         data.qpos = pose
         mujoco.mj_forward(eye.model, data)
         data.light_xpos[:] = camera.lookat - SUN_AWAY * np.asarray(SUN)
@@ -151,7 +151,7 @@ def _way(clip: Clip, now: float) -> np.ndarray:
     return points[np.unique(length // PIECE, return_index=True)[1]]
 
 
-def _cameras(clip: Clip, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
+def cameras(clip: Clip, seconds: np.ndarray, size: float) -> list[mujoco.MjvCamera]:
     """Cameras behind the robot and to its side, so that the goal is in the frame."""
     ahead = clip.goal(clip.times)[:, :2] - clip.position[:, :2]
     turn = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
