@@ -12,7 +12,7 @@ from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
 from genidm.provenance import code_of, command, environment
 from genidm.report import Row, origin, results, text
-from genidm.runs.cell import saved
+from genidm.runs.cell import load_runs
 from genidm.runs.command import run_cli
 
 
@@ -37,7 +37,7 @@ def main(
     Raises:
       BadInput: no runs, or runs of different robots.
     """
-    robot, models = saved(runs, engine)
+    robot, models = load_runs(runs, engine)
     test_scenarios, rows = scenarios(robot, seeds, episodes, first_seed), []
     here = {**environment(), "command": command()}
     tested = origin(code_of("genidm.evaluation.evaluate", robot, robot.engine), [here])

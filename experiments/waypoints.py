@@ -16,7 +16,7 @@ from genidm.evaluation.waypoints import WaypointRuns, WaypointSettings, follow_w
 from genidm.provenance import environment
 from genidm.report import draw_waypoint_runs
 from genidm.report.rows import jsonable
-from genidm.runs.cell import saved
+from genidm.runs.cell import load_runs
 from genidm.runs.command import run_cli
 
 # Metres. The path goes ahead, turns left by more than 180°, and ends 2.8 m from its start.
@@ -53,7 +53,7 @@ def main(
     check_value("seed", seed, checks.seed())
     points = in_twos(waypoints)
     files.check_writable(out, directory=True)
-    robot, models = saved(runs, engine)
+    robot, models = load_runs(runs, engine)
     keys, turned = jax.random.split(jax.random.key(seed), robots), jnp.full(robots, yaw)
     made = dict[str, WaypointRuns]()
     for name, (model, _) in models.items():

@@ -176,6 +176,8 @@ def load(
     if made_for != robot.name:
         raise BadInput(f"{path} holds a controller for {shown(made_for)}, not for {robot.name}")
     _same_layouts(path, meta, robot)
+    if not {"goal_conditioned", "input_frame"} & meta.keys():
+        raise BadInput(f"{path} was made by an older version of genidm: make it again")
     restore = Policy.restore if "goal_conditioned" in meta else Controller.restore
     try:
         made = restore(tree, meta, robot)

@@ -54,9 +54,11 @@ def test_the_method_with_paper_settings_is_the_papers() -> None:
 
 def test_scales_are_shares_of_the_paper() -> None:
     assert scale_of("paper", 2000) == Scale("paper", 2000, 1.0, 10, 1000)
-    assert scale_of("0.1", 2000) == Scale("0.1", 200, 0.1, 10, 100, goal_horizon=50, learning=2 / 3)
+    assert scale_of("0.1", 2000) == Scale(
+        "0.1", 200, 0.1, 10, 100, goal_horizon=50, min_learning_fraction=2 / 3
+    )
     million = scale_of("0.5", 2_000_000)
-    assert million == Scale("0.5", 1_000_000, 0.5, 10, 500, learning=2 / 3)
+    assert million == Scale("0.5", 1_000_000, 0.5, 10, 500, min_learning_fraction=2 / 3)
     assert scale_of("2", 2_000_000) == Scale("2", 4_000_000, 1.0, 10, 1000)
     quick = scale_of("quick", 2_000_000)
     assert quick.interactions < 500_000 and quick.updates < 0.5 and quick.goal_horizon < 100

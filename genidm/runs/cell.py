@@ -69,7 +69,7 @@ def run_method(robot: Robot, method: GoalConditioned | InverseDynamics, options:
 def execute(this: Run[Any], options: Options) -> Path:
     """Tests a run, renders it if asked, writes the report; returns the report's directory."""
     announce(this.robot, options.engine)
-    say(this.notes)
+    print_notes(this.notes)
     tested = scenarios_of(this, options)
     stage = this.run_test(tested)
     if options.video:
@@ -77,7 +77,7 @@ def execute(this: Run[Any], options: Options) -> Path:
     return write_report(this, tested, options, [stage])
 
 
-def saved(
+def load_runs(
     runs: Sequence[Path], engine: str | None = None
 ) -> tuple[Robot, dict[str, tuple[ControllerFn, dict[str, Any]]]]:
     """Loads the controllers of finished runs, for a comparison.
@@ -162,7 +162,7 @@ def write_report(
     )  # fmt: skip
 
 
-def say(notes: Iterable[str]) -> None:
+def print_notes(notes: Iterable[str]) -> None:
     """Prints notes on stderr."""
     for note in notes:
         print(note, file=sys.stderr)

@@ -93,7 +93,9 @@ def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
     """Adapts updates, horizon and fractions to the scale's shorter record."""
     agent = method.agent
     if isinstance(agent, Frozen):
-        agent = dataclasses.replace(agent, fraction=max(agent.fraction, scale.learning))
+        agent = dataclasses.replace(
+            agent, fraction=max(agent.fraction, scale.min_learning_fraction)
+        )
     updates = max(1, round(method.fit.updates * scale.updates))
     return dataclasses.replace(
         method,

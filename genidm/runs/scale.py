@@ -9,7 +9,7 @@ from genidm.errors import BadInput
 from genidm.paper import protocol
 
 # Up to this many interactions, an agent still falls early in most episodes.
-YOUNG = 400_000
+SHORT_RUN = 400_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Scale:
       seeds: number of test seeds.
       episodes: test episodes per seed.
       goal_horizon: upper limit of a method's `goal_horizon`, steps. With few interactions
-        (`YOUNG`) most episodes end in an early fall, and few are longer.
+        (`SHORT_RUN`) most episodes end in an early fall, and few are longer.
       fraction: lower limit of a method's `fraction` of the record: in the first half of a
         short record the agent hardly walks.
-      learning: lower limit of the fraction of interactions in which an agent learns before it
-        is frozen: with few interactions it needs most of them to learn to walk.
+      min_learning_fraction: lower limit of the fraction of interactions in which an agent learns
+        before it is frozen: with few interactions it needs most of them to learn to walk.
       ppo: replaces PPO at default settings (policy layers are kept). The defaults learn
         steadily but slowly; a short run must learn more from each interaction.
     """
@@ -39,7 +39,7 @@ class Scale:
     episodes: int
     goal_horizon: int = 1000
     fraction: float = 0.0
-    learning: float = 0.0
+    min_learning_fraction: float = 0.0
     ppo: PPO = dataclasses.field(default_factory=PPO)
 
 
@@ -58,7 +58,15 @@ def scale_of(text: str, interactions: int) -> Scale:
     if text == "quick":
         hurried = PPO(discounting=0.97, learning_rate=1e-3, entropy_cost=0.0)
         return Scale(
-            "quick", 400_000, 0.1, 2, 50, goal_horizon=50, fraction=1.0, learning=2 / 3, ppo=hurried
+            "quick",
+            400_000,
+            0.1,
+            2,
+            50,
+            goal_horizon=50,
+            fraction=1.0,
+            min_learning_fraction=2 / 3,
+            ppo=hurried,
         )
     try:
         share = float(text)
@@ -73,6 +81,6 @@ def scale_of(text: str, interactions: int) -> Scale:
         updates=min(share, 1.0),
         seeds=protocol.TEST_SEEDS,
         episodes=max(10, round(protocol.TEST_EPISODES * min(share, 1.0))),
-        goal_horizon=1000 if interactions > YOUNG else 50,
-        learning=2 / 3 if share < 1 else 0.0,
+        goal_horizon=1000 if interactions > SHORT_RUN else 50,
+        min_learning_fraction=2 / 3 if share < 1 else 0.0,
     )
