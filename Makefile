@@ -36,15 +36,15 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)  ## RS and LR on the Ant at small scale, from nothing to the table
 	$(BIN)/python -m experiments.table1 --robot ant --methods RS LR --scale quick --run-dir runs/demo
 
-# RESULTS is a directory of its own, so that LR-0-* matches one run. It takes days on two cores; if
+# RESULTS is a directory of its own, so that a method has one run in it (LR-0 and ten digits). It takes days on two cores; if
 # stopped, the same command resumes. The last command needs EXTRAS=dev,benchmark.
 results: $(STAMP)  ## make everything in experiments/results again, with runs in RESULTS (docs/runs.md)
 	@set -e; \
 	for robot in ant humanoid minitaur; do \
 	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --run-dir $(RESULTS) \
 	    --report-dir experiments/results; \
-	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-* $(RESULTS)/$$robot/GE-0-* \
-	    $(RESULTS)/$$robot/VGCP-0-* $(RESULTS)/$$robot/HF-0-* --goal-radius 1 --out experiments/results; \
+	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-?????????? $(RESULTS)/$$robot/GE-0-?????????? \
+	    $(RESULTS)/$$robot/VGCP-0-?????????? $(RESULTS)/$$robot/HF-0-?????????? --goal-radius 1 --out experiments/results; \
 	  $(BIN)/python -m experiments.benchmark --robot $$robot; \
 	done; \
 	$(BIN)/python -m experiments.humanoid_world --run-dir $(RESULTS) --report-dir experiments/results; \

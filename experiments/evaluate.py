@@ -14,6 +14,7 @@ from genidm.provenance import code_of, command, environment
 from genidm.report import Row, origin, results, text
 from genidm.runs.cell import load_runs
 from genidm.runs.command import run_cli
+from genidm.runs.run import TEST
 
 
 def main(
@@ -40,7 +41,7 @@ def main(
     robot, models = load_runs(runs, engine)
     test_scenarios, rows = scenarios(robot, seeds, episodes, first_seed), []
     here = {**environment(), "command": command()}
-    tested = origin(code_of("genidm.evaluation.evaluate", robot, robot.engine), [here])
+    tested = origin(code_of(*TEST, robot, robot.engine), [here])
     for name, (model, fitted) in models.items():
         outcome = evaluate(robot, model, test_scenarios, test)
         sanity.walked(name, outcome)

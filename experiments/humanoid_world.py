@@ -8,6 +8,7 @@ invariance: the same episodes, actions and 𝒢, another s.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Annotated, Any
 
 import jax.numpy as jnp
@@ -16,11 +17,13 @@ import tyro
 
 from experiments import table1
 from genidm.experience import Experience
-from genidm.paper.methods import by_name
-from genidm.robots import Humanoid, HumanoidWorld
+from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.robots import Humanoid, HumanoidWorld, Robot
 from genidm.runs.cell import make_run
 from genidm.runs.command import run_cli
-from genidm.runs.run import InverseDynamicsRun
+from genidm.runs.resolve import Options
+from genidm.runs.run import InverseDynamicsRun, Run
+from genidm.store import Stage
 
 METHODS = ("RL", "GE", "LR")
 
@@ -36,31 +39,54 @@ def in_world(s: np.ndarray) -> np.ndarray:
     return np.asarray(world.rotate(heading.rotate(x, -yaw), yaw))
 
 
-def record(options: table1.Table) -> Experience:
-    """Stores the Humanoid's experience, converted, as HumanoidWorld's; collects it if missing."""
-    lr = by_name("LR", Humanoid.name)
-    source, target = (
-        make_run(robot(engine=options.engine), lr, options) for robot in (Humanoid, HumanoidWorld)
-    )
-    assert isinstance(source, InverseDynamicsRun) and isinstance(target, InverseDynamicsRun)
-    stage = target.experience_stage
+@dataclasses.dataclass(frozen=True)
+class ConvertedRun(InverseDynamicsRun):
+    """A run on the experience of another run, converted by `in_world`.
 
-    def work() -> dict[str, Any]:
-        experience = source.experience()
+    Attributes:
+      source: the run of the Humanoid.
+    """
+
+    source: InverseDynamicsRun | None = None
+
+    @functools.cached_property
+    def experience_stage(self) -> Stage:
+        assert self.source
+        config = {"converted_from": self.source.experience_stage.directory.name}
+        return self._stage(f"experience-converted-{self.seed}", config, __name__)
+
+    @property
+    def sources(self) -> list[Stage]:
+        assert self.source
+        return [*self.source.sources[:-1], *super().sources]
+
+    def _collected(self, made: list[Experience]) -> dict[str, Any]:
+        assert self.source
+        stage, experience = self.experience_stage, self.source.experience()
         converted = experience.replace(s=in_world(experience.s))
         converted.save(stage.path("experience") / "chunk_00000", overwrite=True)
-        return source.experience_stage.summary()
+        made.append(converted)
+        summary: dict[str, Any] = self.source.experience_stage.summary()
+        return summary
 
-    stage.run_once(work)
-    return target.experience()
+
+def converted(
+    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
+) -> Run[Any]:
+    """The run of a method on HumanoidWorld, on the experience of the same run on the Humanoid."""
+    source = make_run(Humanoid(engine=options.engine), method, options)
+    run = make_run(robot, method, options)
+    if not isinstance(source, InverseDynamicsRun):
+        return run
+    fields = {f.name: getattr(run, f.name) for f in dataclasses.fields(run)}
+    return ConvertedRun(**fields, source=source)
 
 
 def main(
     options: Annotated[table1.Table, tyro.conf.arg(name="")] = table1.Table(methods=METHODS),
 ) -> None:
     """Converts the Humanoid's experience to the world's frame and runs the methods on it."""
-    record(options)
-    table1.table1(dataclasses.replace(options, robot=HumanoidWorld.name))
+    table1.table1(dataclasses.replace(options, robot=HumanoidWorld.name), converted)
 
 
 if __name__ == "__main__":

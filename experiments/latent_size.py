@@ -9,13 +9,14 @@ from typing import Annotated, Any
 import tyro
 
 from genidm import files
+from genidm.checks import check, count, layers
 from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.evaluation import stats
-from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import LR, InverseDynamics
-from genidm.provenance import environment
+from genidm.paper import methods
+from genidm.paper.methods import InverseDynamics
+from genidm.provenance import code_digest
 from genidm.report.figures import latent_sizes
 from genidm.report.rows import jsonable
 from genidm.report.runs import Tested
@@ -45,8 +46,10 @@ class Sweep(Options):
     repeats: int = 3
 
     def __post_init__(self) -> None:
-        if self.repeats < 1 or not self.sizes or min(self.sizes) < 1:
-            raise BadInput("repeats and sizes must be at least 1")
+        super().__post_init__()
+        check(self, repeats=count(), sizes=layers)
+        if not self.sizes:
+            raise BadInput("sizes must hold at least 1 latent size")
 
 
 def sized(method: InverseDynamics, k: int) -> InverseDynamics:
@@ -84,11 +87,13 @@ def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
     announce(robot, options.engine)
     first = next(iter(runs.values()))[0]
     scenarios = scenarios_of(first, options)
-    tests = {
+    found = {
         k: [tested(this, scenarios, options.video) for this in these] for k, these in runs.items()
     }
-    written = document(first, method, scenarios, tests)
-    here = first.root / f"{KIND}-{first.scale.name}"
+    tests = {k: [test.episodes for test in of_k] for k, of_k in found.items()}
+    written = document(first, method.fit.latent_size, scenarios, found)
+    engine = [robot.engine_name] if robot.engine_name and len(robot.engines) > 1 else []
+    here = first.root / "-".join([KIND, first.scale.name, *engine])
     for directory in (here, options.report_dir):
         if directory:
             files.save_json(Path(directory) / f"{robot.name}_{KIND}.json", written)
@@ -99,43 +104,52 @@ def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
     return here
 
 
-def tested(this: InverseDynamicsRun, scenarios: Scenarios, video: bool) -> Episodes:
-    """Runs a fit's test if it is not finished, renders it if `video`; returns its episodes."""
+def tested(this: InverseDynamicsRun, scenarios: Scenarios, video: bool) -> Tested:
+    """Runs a fit's test if it is not finished, and renders it if `video`."""
     stage = this.run_test(scenarios, KIND)
     if video:
         render_run(this)
-    return Tested(stage.directory, stage.summary()).episodes
+    return Tested(stage.directory, stage.summary())
 
 
 def document(
-    first: InverseDynamicsRun,
-    method: InverseDynamics,
-    scenarios: Scenarios,
-    tests: dict[int, list[Episodes]],
+    first: InverseDynamicsRun, k: int | None, scenarios: Scenarios, tests: dict[int, list[Tested]]
 ) -> dict[str, Any]:
     """The figure as one JSON document, distances in metres.
 
+    Args:
+      first: a run of the figure.
+      k: the method's own latent size.
+      scenarios: of the tests.
+      tests: latent size → the test of each fit.
+
     Returns:
-      robot, scale, training_seed, scenarios, experience, settings, versions, hardware; and
-      sizes: k → `stats.spread` over its fits, with fits: `stats.summary` of each fit's test.
+      robot, scale, training_seed, scenarios, experience, settings; and sizes: k → `stats.spread`
+      over its fits, with fits: `stats.summary` of each fit's test, and what `made` its stages.
     """
-    found = environment()
+    fit = dataclasses.replace(first.method.fit, latent_size=k)
     return {
         "robot": first.robot.name,
         "scale": first.scale.name,
         "training_seed": first.seed,
         "scenarios": scenarios.digest(),
         "experience": first.experience_stage.directory.name,
-        "versions": found["versions"],
-        "hardware": found["hardware"],
-        "settings": to_json(method),
+        "settings": to_json(dataclasses.replace(first.method, fit=fit)),
         "sizes": jsonable({k: size(fits) for k, fits in tests.items()}, digits=6),
     }
 
 
-def size(fits: list[Episodes]) -> dict[str, Any]:
+def size(fits: list[Tested]) -> dict[str, Any]:
     """The numbers of one k: over all its fits, and of each fit."""
-    return {**stats.spread(fits), "fits": [stats.summary(fit) for fit in fits]}
+    return {
+        **stats.spread([fit.episodes for fit in fits]),
+        "fits": [stats.summary(fit.episodes) | {"made": made_by(fit)} for fit in fits],
+    }
+
+
+def made_by(test: Tested) -> dict[str, Any]:
+    """Stage → what made it, with the digest of its code."""
+    return {name: o | {"code": code_digest(o["code"])} for name, o in test.made.items()}
 
 
 def text(written: dict[str, Any]) -> str:
@@ -157,7 +171,9 @@ def metres(value: float | None) -> str:
 def latent_size(options: Annotated[Sweep, tyro.conf.arg(name="")] = Sweep()) -> None:
     """Fits and tests all sizes, and prints the numbers."""
     robot = by_name(options.robot, options.engine)
-    print((run(robot, LR, options) / "table.txt").read_text(encoding="utf-8"))
+    lr = methods.by_name("LR", robot.name)
+    assert isinstance(lr, InverseDynamics)
+    print((run(robot, lr, options) / "table.txt").read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

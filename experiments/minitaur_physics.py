@@ -26,7 +26,7 @@ from experiments.minitaur_processes import processes_table, vectorised
 from experiments.physics import metres, table
 from genidm import devices, files, symmetry
 from genidm.errors import BadInput
-from genidm.provenance import environment
+from genidm.report.rows import made_now
 from genidm.robots import Minitaur
 from genidm.robots.minitaur import from_rows
 from genidm.robots.minitaur_world import (
@@ -315,7 +315,9 @@ def minitaur_physics(options: Annotated[Options, tyro.conf.arg(name="")] = Optio
             results[name] = rows()
             print(show(results[name]), end="\n\n", flush=True)
     load = [before, os.getloadavg()[0]]
-    files.save_json(options.out, {"options": options, "load": load, **results, **environment()})
+    files.save_json(
+        options.out, {"options": options, "load": load, **results, "made": made_now(__name__)}
+    )
 
 
 if __name__ == "__main__":

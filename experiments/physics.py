@@ -30,7 +30,7 @@ from genidm.engines import ENGINES, Physics
 from genidm.engines.mujoco import MuJoCo
 from genidm.errors import BadInput
 from genidm.progress import Progress, compile_ahead
-from genidm.provenance import environment
+from genidm.report.rows import made_now
 from genidm.robots import ROBOTS, State
 from genidm.robots.base import select
 from genidm.robots.mujoco import MujocoRobot, Solver
@@ -295,7 +295,7 @@ def physics(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> 
         "load": [before, os.getloadavg()[0]],
         "stability": stable,
         "drift": turned,
-        **environment(),
+        "made": made_now(__name__, "genidm.engines.mjx", "genidm.engines.mujoco"),
     }
     out = options.out or Path(f"experiments/results/{options.robot}_physics.json")
     files.save_json(out, results)

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +25,7 @@ from genidm.runs.run import Run
 from genidm.store import Stage
 
 Methods = Sequence[GoalConditioned | InverseDynamics]
+MakeRun = Callable[[Robot, GoalConditioned | InverseDynamics, Options], Run[Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,11 +96,11 @@ class Work:
         return f"{self.run.method.name}, training seed {self.run.seed}"
 
 
-def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
+def work(robot: Robot, methods: Methods, options: Table, make: MakeRun = make_run) -> list[Work]:
     """The runs of the table, seed by seed; later seeds use only the first scenarios."""
     numbers = range(options.seed, options.seed + options.seeds)
     seeds = [dataclasses.replace(options, seed=seed) for seed in numbers]
-    first, *later = ([make_run(robot, m, these) for m in grouped(methods)] for these in seeds)
+    first, *later = ([make(robot, m, these) for m in grouped(methods)] for these in seeds)
     scenarios = few = scenarios_of(first[0], options)
     if later and options.episodes_per_extra_seed < scenarios.shape[1]:
         few = scenarios_of(
@@ -112,7 +113,9 @@ def work(robot: Robot, methods: Methods, options: Table) -> list[Work]:
     ]
 
 
-def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, list[Exception]]:
+def run(
+    robot: Robot, methods: Methods, options: Table, make: MakeRun = make_run
+) -> tuple[Path | None, list[Exception]]:
     """Runs every cell that is not finished, then writes one table of all.
 
     If a cell fails, the others still run.
@@ -121,6 +124,7 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
       robot: the robot.
       methods: the methods, in any order.
       options: settings of the table.
+      make: makes the run of a method.
 
     Returns:
       the directory of the report, or None if every cell on the table's own scenarios failed; and
@@ -129,7 +133,7 @@ def run(robot: Robot, methods: Methods, options: Table) -> tuple[Path | None, li
     Raises:
       BadInput: an option is invalid; then nothing has run.
     """
-    todo = work(robot, methods, options)
+    todo = work(robot, methods, options, make)
     announce(robot, options.engine)
     failures, tests, ended, first = list[Exception](), list[Stage](), False, todo[0]
     for number, item in enumerate(todo, 1):
@@ -160,10 +164,15 @@ def attempt(item: Work) -> Stage | Exception:
         return error
 
 
-def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
+def main(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
     """Runs the cells and prints the table; the exit status is not 0 if a cell failed."""
+    table1(options)
+
+
+def table1(options: Table, make: MakeRun = make_run) -> None:
+    """`main`, with runs that `make` makes."""
     robot = robot_by_name(options.robot, options.engine)
-    report, failures = run(robot, chosen(options), options)
+    report, failures = run(robot, chosen(options), options, make)
     if report:
         print((report / "table.txt").read_text(encoding="utf-8"))
     if failures:
@@ -172,4 +181,4 @@ def table1(options: Annotated[Table, tyro.conf.arg(name="")] = Table()) -> None:
 
 
 if __name__ == "__main__":
-    run_cli(table1, "Table 1: every method on one robot, and the spread over training seeds.")
+    run_cli(main, "Table 1: every method on one robot, and the spread over training seeds.")

@@ -13,9 +13,8 @@ import tyro
 from genidm import checks, files
 from genidm.checks import check_value, count, number
 from genidm.evaluation.waypoints import WaypointRuns, WaypointSettings, follow_waypoints, in_twos
-from genidm.provenance import environment
 from genidm.report import draw_waypoint_runs
-from genidm.report.rows import jsonable
+from genidm.report.rows import jsonable, made_now
 from genidm.runs.cell import load_runs
 from genidm.runs.command import run_cli
 
@@ -64,7 +63,8 @@ def main(
         "waypoints": points,
         "engine": str(robot.engine),
         "methods": jsonable(summary, digits=4),
-        **environment(),
+        "made": made_now("genidm.evaluation.waypoints", robot, robot.engine),
+        "controllers": {name: str(path) for name, path in zip(models, runs, strict=True)},
     }
     name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", written)

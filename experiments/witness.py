@@ -23,6 +23,7 @@ import numpy as np
 from genidm import files
 from genidm.agents.sac import SAC
 from genidm.paper.methods import HER_SP
+from genidm.report.rows import made_now
 from genidm.robots import Ant
 from genidm.runs.command import run_cli
 from genidm.tasks import GoToGoal
@@ -207,6 +208,7 @@ def main(
     test.action_space.seed(seed)
     chance = closest(test, lambda _: test.action_space.sample(), episodes)
     result: dict[str, Any] = {"random": summary(chance), "HER + SAC": {}}
+    result["made"] = made_now(__name__)
     began = time.process_time()
     for _ in range(parts):
         agent.learn(interactions // parts, reset_num_timesteps=False)

@@ -42,6 +42,8 @@ UNRELATED = frozenset(
     )
 )
 _PACKAGE = Path(__file__).resolve().parent
+# An edit while a process runs changes the files, but not the code that the process runs.
+_AT_START = {path: path.read_text(encoding="utf-8") for path in _PACKAGE.rglob("*.py")}
 
 
 def code_of(*roots: Any, alone: Iterable[str] = ()) -> dict[str, str]:
@@ -100,7 +102,9 @@ def _defined_in(kind: type) -> Iterator[str]:
 def _tree(name: str) -> ast.Module | None:
     """The syntax tree of a module of genidm or of the user; None of other modules."""
     path = _path(name)
-    return ast.parse(path.read_text(encoding="utf-8")) if path else None
+    if path is None:
+        return None
+    return ast.parse(_AT_START.get(path) or path.read_text(encoding="utf-8"))
 
 
 def _path(name: str) -> Path | None:
@@ -110,22 +114,31 @@ def _path(name: str) -> Path | None:
     if module is None and (name == "genidm" or name.startswith("genidm.")):
         parts = name.split(".")[1:]
         file = str(_PACKAGE.joinpath(*parts).with_suffix(".py"))
-    path = Path(file) if file else None
-    ours = path is not None and path.suffix == ".py" and path.name != "__init__.py"
-    if path is None or not ours or "site-packages" in path.parts or not path.exists():
+    path = Path(file).resolve() if file else None
+    if path is None or path.suffix != ".py" or path.name == "__init__.py" or not path.exists():
         return None
-    return None if Path(os.__file__).parent in path.parents else path
+    if _PACKAGE in path.parents:
+        return path
+    installed = "site-packages" in path.parts or Path(os.__file__).parent in path.parents
+    return None if installed else path
 
 
 @functools.cache
 def _digest(name: str) -> str:
-    tree = _tree(name)
-    assert tree
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [x for x in body if not _is_text(x)]  # type: ignore[attr-defined]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:10]
+    return hashlib.sha256(dump(_tree(name)).encode()).hexdigest()[:10]
+
+
+def dump(node: Any) -> str:
+    """A syntax tree as text, without docstrings; the same with every version of Python.
+
+    `ast.dump` is not: newer versions add fields, and leave out empty ones.
+    """
+    if isinstance(node, list):
+        return f"[{','.join(dump(x) for x in node if not _is_text(x))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = [(name, x) for name, x in ast.iter_fields(node) if x is not None and x != []]
+    return f"{type(node).__name__}({','.join(f'{name}={dump(x)}' for name, x in fields)})"
 
 
 def _is_text(node: ast.AST) -> bool:
@@ -139,7 +152,7 @@ def _is_text(node: ast.AST) -> bool:
 
 @functools.cache
 def _imported(name: str) -> tuple[str, ...]:
-    """The modules of genidm that a module imports."""
+    """The modules of genidm, and of the user, that a module imports."""
     tree, found = _tree(name), list[str]()
     assert tree
     for node in ast.walk(tree):
@@ -147,7 +160,7 @@ def _imported(name: str) -> tuple[str, ...]:
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return tuple(n for n in found if n.startswith("genidm.") and _path(n))
+    return tuple(n for n in found if _path(n))
 
 
 @functools.cache
@@ -155,8 +168,9 @@ def environment() -> dict[str, Any]:
     """The versions, machine and commit that make results here.
 
     Returns:
-      `versions` of packages (None if not installed), `hardware` in one line, git `commit` and
-      whether its tree is `clean` (both None outside a clone).
+      `versions` of packages (None if not installed), `hardware` in one line, the settings of
+      `jax` that change bits, git `commit` and whether its tree is `clean` (both None outside a
+      clone).
     """
     versions: dict[str, str | None] = {"python": platform.python_version()}
     for package in PACKAGES:
@@ -164,11 +178,17 @@ def environment() -> dict[str, Any]:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
+    settings = jax.config.values
     devices = f"{jax.device_count()} jax devices ({jax.devices()[0].device_kind})"
     commit, clean = _commit()
     return {
         "versions": versions,
         "hardware": f"{_machine()}, {devices}",
+        "jax": {
+            "enable_x64": settings["jax_enable_x64"],
+            "matmul_precision": settings["jax_default_matmul_precision"],
+            "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+        },
         "commit": commit,
         "clean": clean,
     }

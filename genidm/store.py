@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import glob
 import importlib
 import importlib.util
 import os
@@ -37,9 +39,11 @@ class Stage:
 
     Attributes:
       directory: `root/name-<digest of config and code>`.
+      opened_with: config and code, until they are written; None where a path was given.
     """
 
     directory: Path
+    opened_with: Any = dataclasses.field(default=None, compare=False, repr=False)
 
     @classmethod
     def open(
@@ -50,7 +54,7 @@ class Stage:
         code: Mapping[str, str] | None = None,
         reuse: bool = False,
     ) -> Stage:
-        """Opens the stage of a config and code, and makes its directory if it is missing.
+        """Opens the stage of a config and code; nothing is written before work begins.
 
         If a finished stage has the same config but other code, this prints on stderr which
         modules differ, and returns the stage of this code (with `reuse`, the finished stage).
@@ -64,22 +68,20 @@ class Stage:
         """
         code = dict(code or {})
         key = {"config": config, "code": code_digest(code)} if code else config
-        stage = cls(Path(root) / f"{name}-{digest(key)}")
+        stage = cls(Path(root) / f"{name}-{digest(key)}", {"config": config, "code": code})
         if not stage.done:
             other = stage._of_other_code(name, config, code)
             if other and reuse:
-                print(f"warning: {_differs(other, code)}; it is used", file=sys.stderr)
+                _say_once(f"warning: {_differs(other, code)}; it is used")
                 return other
             if other and not stage.path(CONFIG).exists():
-                print(f"{_differs(other, code)}: made anew", file=sys.stderr)
-        if not _is_json(stage.path(CONFIG)):
-            save_json(stage.path(CONFIG), {"config": config, "code": code})
+                _say_once(f"{_differs(other, code)}: made anew")
         return stage
 
     def _of_other_code(self, name: str, config: Any, code: Mapping[str, str]) -> Stage | None:
         """The newest finished stage with the same config and other code."""
         wanted, found = to_json(config), []
-        for path in self.directory.parent.glob(f"{name}-*/{DONE}"):
+        for path in self.directory.parent.glob(f"{glob.escape(name)}-*/{DONE}"):
             other = Stage(path.parent)
             with contextlib.suppress(BadInput, KeyError, TypeError):
                 there = load_json(other.path(CONFIG))
@@ -89,8 +91,9 @@ class Stage:
 
     @property
     def code(self) -> dict[str, str]:
-        """Module → digest of the code that made the stage."""
-        code: dict[str, str] = load_json(self.path(CONFIG))["code"]
+        """Module → digest of the code that makes, or has made, the stage."""
+        config = self.opened_with or load_json(self.path(CONFIG))
+        code: dict[str, str] = config["code"]
         return code
 
     @property
@@ -129,6 +132,8 @@ class Stage:
         """
         if self.done:
             return
+        with disk(self.directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
         with alone(self.directory):
             if not self.done:
                 begun = self._begin()
@@ -139,6 +144,8 @@ class Stage:
 
     def _begin(self) -> float:
         """Records this command in `made.json`; warns if another environment began the stage."""
+        if self.opened_with and not _is_json(self.path(CONFIG)):
+            save_json(self.path(CONFIG), self.opened_with)
         sessions, here = self.made, environment()
         if sessions and self.path("checkpoints").exists():
             before = sessions[-1]
@@ -185,6 +192,12 @@ class Stage:
         """Removes all checkpoints."""
         with disk(self.directory):
             remove(self.path("checkpoints"))
+
+
+@functools.cache
+def _say_once(message: str) -> None:
+    """Prints a message on stderr, once per process."""
+    print(message, file=sys.stderr)
 
 
 def _is_json(path: Path) -> bool:

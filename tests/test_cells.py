@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from bits import truncate
 from point import Point
 from small_cells import LR, VGCP, Finished, command, counted, files, options, stage_of
 from tiny import TEST
@@ -120,6 +121,15 @@ def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Pa
     written = files(tmp_path / "results")
     assert written["point_0.5.json"] == (copy / results).read_bytes() == was
     assert {"point_0.5_table.txt", "point_0.5_violins.png", "point_0.5_paths.png"} <= written.keys()
+
+
+def test_a_test_that_cannot_be_read_is_left_out_of_the_report(copy: Path, capsys) -> None:
+    stage = next(copy.glob("point/test-RS-0-*"))
+    truncate(stage / "episodes" / "episodes.closest.npy")
+    command(copy)
+    said = capsys.readouterr()
+    assert f"warning: {stage / 'done.json'} is not the summary of a test" in said.err
+    assert "LR" in said.out and "\nRS " not in said.out
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"scale": "0.5", "test": {}}', "\x00"])

@@ -54,6 +54,7 @@ def test_the_method_with_paper_settings_is_the_papers() -> None:
 
 def test_scales_are_shares_of_the_paper() -> None:
     assert scale_of("paper", 2000) == Scale("paper", 2000, 1.0, 10, 1000)
+    assert scale_of("1", 2000) == scale_of("1.0", 2000) == scale_of("paper", 2000)
     assert scale_of("0.1", 2000) == Scale(
         "0.1", 200, 0.1, 10, 100, goal_horizon=50, min_learning_fraction=2 / 3
     )

@@ -73,7 +73,9 @@ def test_without_a_home_programs_are_not_kept_and_that_is_said_once() -> None:
 def test_a_variable_that_is_no_number_is_said_in_a_sentence(name: str, value: str) -> None:
     made = python(COMMAND, **{name: value})
     assert made.returncode == 2 and made.stdout == ""
-    assert made.stderr.startswith(f"error: {name} is a number of ") and made.stderr.count("\n") == 1
+    assert (
+        made.stderr.startswith(f"error: {name} must be a number ") and made.stderr.count("\n") == 1
+    )
 
 
 SAVING = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import json
 import re
@@ -105,6 +106,27 @@ def test_an_edit_changes_what_depends_on_it_and_prose_changes_nothing(tmp_path: 
         "genidm.a"
     ]
     assert code_digest(before) != code_digest(code_with(tmp_path, b="x = 2\n"))
+
+
+def test_an_edit_while_a_process_runs_is_not_its_code(tmp_path: Path) -> None:
+    before = code_with(tmp_path)
+    edit = "import genidm.provenance as p; open('genidm/b.py', 'w').write('x = 3'); "
+    out = subprocess.run(
+        [sys.executable, "-B", "-c", edit + PRINT], cwd=tmp_path, capture_output=True, check=True,
+        env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"},
+    ).stdout  # fmt: skip
+    assert json.loads(out) == before
+    assert (tmp_path / "genidm" / "b.py").read_text() == "x = 3"
+
+
+def test_a_digest_does_not_see_what_python_versions_add_to_a_tree() -> None:
+    source = "def f(x, *, y=1):\n    return [x, y]\n"
+    plain, with_more = ast.parse(source), ast.parse(source)
+    function = with_more.body[0]
+    function._fields = (*function._fields, "type_params")  # as Python 3.12 has it
+    function.type_params = []  # type: ignore[attr-defined]
+    assert provenance.dump(plain) == provenance.dump(with_more)
+    assert provenance.dump(plain) != provenance.dump(ast.parse(source.replace("1", "2")))
 
 
 def test_environment_names_versions_and_hardware() -> None:

@@ -163,7 +163,7 @@ def test_a_buffer_of_another_size_is_refused(tmp_path: Path) -> None:
     for max_replay_size in (ROWS * LANES // 2, 2 * ROWS * LANES):
         part = rows.replace(**{k: x[:UNROLL] for k, x in vars(rows).items()})
         like = {**LIKE, "learner": {**LIKE["learner"], "buffer": empty(part, max_replay_size)}}
-        with pytest.raises(BadInput, match=r"rows/a is float32\[0, 12, 5, 1\] there"):
+        with pytest.raises(BadInput, match=r"rows/a is float32\[0, 12, 5, 1\] in the"):
             Remembering(Checkpoints(tmp_path)).latest(like)
 
 

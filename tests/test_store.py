@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,18 +28,21 @@ from genidm.store import Stage
 def test_a_stage_is_found_again_and_knows_whether_it_is_done(tmp_path: Path) -> None:
     stage = Stage.open(tmp_path, "collect", Config())
     assert stage.directory == tmp_path / f"collect-{digest(Config())}"
-    config = load_json(stage.path("config.json"))
-    assert config["config"] == to_json(Config())
-    assert config["code"] == {}
-    assert not stage.done
-    stage.checkpoints().save(3, {"a": 1})
-    assert Stage.open(tmp_path, "collect", Config()).checkpoints().steps() == [3]
-    stage.finish({"interactions": np.int64(7), "mean": np.float32(0.5)})
-    stage.clear_checkpoints()
+    assert not stage.done and not stage.directory.exists(), "nothing is written by a look"
+
+    def work() -> dict[str, Any]:
+        stage.checkpoints().save(3, {"a": 1})
+        assert Stage.open(tmp_path, "collect", Config()).checkpoints().steps() == [3]
+        assert load_json(stage.path("config.json")) == {"config": to_json(Config()), "code": {}}
+        return {"interactions": np.int64(7), "mean": np.float32(0.5)}
+
+    stage.run_once(work)
     again = Stage.open(tmp_path, "collect", Config())
     assert again.done and again.summary() == {"interactions": 7, "mean": 0.5}
     assert again.checkpoints().steps() == []
-    assert sorted(p.name for p in stage.directory.iterdir()) == ["config.json", "done.json"]
+    assert sorted(p.name for p in stage.directory.iterdir()) == [
+        *("config.json", "done.json", "made.json"),
+    ]
     assert not Stage.open(tmp_path, "collect", Other()).done
 
 

@@ -313,7 +313,7 @@ def command(monkeypatch, *flags: str) -> int:
     """The exit status of `python -m experiments.table1`."""
     monkeypatch.setattr(sys, "argv", ["table1", *flags])
     try:
-        run_cli(table1.table1, "")
+        run_cli(table1.main, "")
     except SystemExit as end:
         return int(end.code or 0)
     return 0
@@ -356,7 +356,7 @@ def test_the_exit_status_tells_of_failures(
     assert (
         command(monkeypatch, "--robot", "point", "--methods", "LR", "RS", "--seed", "4") == status
     )
-    ((robot, rows, given),) = asked
+    ((robot, rows, given, _),) = asked
     assert (robot.name, [row.name for row in rows], given.seed) == ("point", ["LR", "RS"], 4)
     out = capsys.readouterr()
     assert out.out == "the table\n"

@@ -18,7 +18,7 @@ from experiments.benchmark.bench import Bench
 from experiments.benchmark.measuring import Probe, Skip, interleave
 from experiments.benchmark.sb3 import Ended
 from genidm.progress import Progress
-from genidm.provenance import environment
+from genidm.provenance import command, environment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +90,8 @@ def _result(
         "ratio_to": full(base) if base else None,
         "ratio": _rounded(ratios[row.name]) if base else None,
         "hardware": environment()["hardware"],
+        "commit": environment()["commit"],
+        "command": command(),
     }
 
 

@@ -1,7 +1,7 @@
 """The paper's numbers: Table 1, Table 2, A.1.2 and A.1.3, for its three robots.
 
 Nothing here is ours. Our choices, where the paper is silent, are in `methods`. A run prints
-and stores its differences from the paper.
+and stores the settings that `--paper-settings` would change.
 """
 
 from __future__ import annotations

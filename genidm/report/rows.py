@@ -13,7 +13,7 @@ import numpy as np
 from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
 from genidm.paper.protocol import METHOD
-from genidm.provenance import code_digest
+from genidm.provenance import code_digest, code_of, command, environment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +140,16 @@ def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
             if row.method not in methods:
                 methods.append(row.method)
     return {module: digests for module, digests in found.items() if len(digests) > 1}
+
+
+def made_now(*code: Any) -> dict[str, Any]:
+    """What makes a result in this process: the `origin` of its command, and its code's digest.
+
+    Args:
+      code: modules or objects that the result depends on (`provenance.code_of`).
+    """
+    made = origin(code_of(*code), [{**environment(), "command": command()}])
+    return {**made, "code": code_digest(made["code"])}
 
 
 def _compared(rows: Sequence[Row]) -> Iterator[tuple[Row, Row]]:

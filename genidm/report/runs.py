@@ -151,12 +151,16 @@ def _finished(
         try:
             summary = files.load_json(path)
             found = (summary["scale"], summary["test"], summary["engine"])
+            test = Tested(path.parent, summary)
+            if found == wanted:
+                # The table reads all of these: one that cannot be read is left out here.
+                _ = test.episodes, *(summary[name] for name in ("method", "seed", "scenarios"))
         except (BadInput, KeyError, TypeError):
             # One file of an older version, or of another program, must not prevent the report.
             print(f"warning: {path} is not the summary of a test; left out", file=sys.stderr)
             continue
         if found == wanted:
-            yield Tested(path.parent, summary)
+            yield test
 
 
 def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:

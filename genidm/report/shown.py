@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import jax
 import numpy as np
 
 from genidm import controller, experience, files, symmetry
+from genidm.errors import BadInput
 from genidm.evaluation import stats
 from genidm.evaluation.invariance import ANGLES, invariance, probes
 from genidm.evaluation.scenarios import FIG8_EPISODES, UNSEEN_YAW, Scenarios, fig8_scenarios
@@ -121,12 +123,15 @@ def _collecting(runs: Runs) -> Curves:
 def _residuals(runs: Runs) -> dict[str, dict[str, np.ndarray]]:
     """Residuals of the replays of the rows' records; of several with one mode, the last by name."""
     records = {stage.name for stage in runs.records}
-    done = (path.parent for path in sorted(runs.root.glob("replay-*/done.json")))
-    of_rows = [
-        s for s in done if files.load_json(s / "config.json")["config"]["experience"] in records
-    ]
-    stages = {stage.name.split("-")[1]: stage for stage in of_rows}
-    return {mode: files.load_arrays(stage / "residual")[0] for mode, stage in stages.items()}
+    found = {}
+    for path in sorted(runs.root.glob("replay-*/done.json")):
+        stage = path.parent
+        with contextlib.suppress(BadInput, KeyError, TypeError):  # of another program, or corrupt
+            config = files.load_json(stage / "config.json")["config"]
+            if config["experience"] in records:
+                mode = config["generalize"]["mode"]
+                found[mode] = files.load_arrays(stage / "residual")[0]
+    return found
 
 
 def _changes(runs: Runs) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from genidm import devices
+from genidm import checks, devices
 from genidm.agents.frozen import Frozen
 from genidm.agents.ppo import PPO
 from genidm.checks import check, count, optional
@@ -52,7 +52,7 @@ class Options:
 
     def __post_init__(self) -> None:
         # A seed has 32 bits: jax would treat 2³² as 0.
-        check(self, seed=count(0, 2**32 - 1), episodes=optional(count()))
+        check(self, seed=checks.seed(), episodes=optional(count()))
 
 
 def resolve(
@@ -122,8 +122,7 @@ def who_set_what(
       up to three lines: settings that `resolve` chose, that the user set, and that differ from
       the paper.
     """
-    unnamed = given.name == method.name
-    papers = paper_settings(given) if isinstance(given, InverseDynamics) and unnamed else given
+    papers = paper_settings(given) if isinstance(given, InverseDynamics) else given
     lines = []
     for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),

@@ -47,6 +47,11 @@ M = TypeVar("M", bound=Method)
 RECORDED_EPISODES = 3
 # Module that makes a record, besides the agent's own.
 COLLECT = "genidm.agents.collect"
+# Modules of the test, besides the robot and its engine.
+TEST = (
+    *("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.evaluation.sanity"),
+    "genidm.controller",
+)
 
 
 class Trace(NamedTuple):
@@ -147,8 +152,7 @@ class Run(abc.ABC, Generic[M]):
         """
         source = self.controller_stage.directory.name
         config = {"fit": source, "scenarios": scenarios.digest(), "test": self.test}
-        code = ("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.controller")
-        return self._stage(f"{kind}-{self._label}", config, *code)
+        return self._stage(f"{kind}-{self._label}", config, *TEST)
 
     def run_test(self, scenarios: Scenarios, kind: str = "test") -> Stage:
         """Runs the test (A.1.3) and the episodes of Fig. 8; returns the finished `test_stage`."""
@@ -296,11 +300,11 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         source = self.replay_stage or self.experience_stage
         # All fields but those that the source stages contain, so that a new field counts too.
         config = {f.name: getattr(self.method, f.name) for f in dataclasses.fields(self.method)}
-        for upstream in dataclasses.fields(Method):
-            del config[upstream.name]
-        again = {"repeat": self.repeat} if self.repeat else {}
-        config = {"source": source.directory.name} | config | again
-        return self._stage(self._label, config, "genidm.paper.fit", "genidm.paper.pairs")
+        for upstream in ("agent", "task"):
+            del config[upstream]
+        config = {"source": source.directory.name, "repeat": self.repeat} | config
+        label = f"{self._label}-fit{self.repeat}" if self.repeat else self._label
+        return self._stage(label, config, "genidm.paper.fit", "genidm.paper.pairs")
 
     @property
     def sources(self) -> list[Stage]:
@@ -349,7 +353,7 @@ class GoalConditionedRun(Run[GoalConditioned]):
     @functools.cached_property
     def controller_stage(self) -> Stage:
         config = self._learning(self.method.agent, self.scale.interactions)
-        return self._stage(self._label, config, COLLECT)
+        return self._stage(self._label, config | {"name": self.method.name}, COLLECT)
 
     @property
     def sources(self) -> list[Stage]:

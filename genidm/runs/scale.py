@@ -74,6 +74,8 @@ def scale_of(text: str, interactions: int) -> Scale:
         share = 0.0
     if not 0 < share < float("inf"):
         raise BadInput(f'--scale takes "quick", "paper" or a number above 0, not {text!r}')
+    if share == 1:
+        return scale_of("paper", interactions)
     interactions = max(1, round(interactions * share))
     return Scale(
         name=f"{share:g}",  # equal values get equal names: 5e-4 and 0.0005
