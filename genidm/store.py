@@ -101,7 +101,7 @@ class Stage:
         """The commands that worked on the stage, oldest first.
 
         Each has command, commit, clean, versions, hardware, start (seconds since 1970) and
-        seconds (duration; None if the command was killed).
+        seconds (duration without that of other stages; None if the command was killed).
         """
         path = self.path(MADE)
         sessions: list[dict[str, Any]] = load_json(path) if path.exists() else []
@@ -136,13 +136,14 @@ class Stage:
             self.directory.mkdir(parents=True, exist_ok=True)
         with alone(self.directory):
             if not self.done:
-                begun = self._begin()
-                summary = work()
-                self._end(begun)
+                self._begin()
+                with _timed() as seconds:
+                    summary = work()
+                self._end(seconds[0])
                 self.finish(summary)
                 self.clear_checkpoints()
 
-    def _begin(self) -> float:
+    def _begin(self) -> None:
         """Records this command in `made.json`; warns if another environment began the stage."""
         if self.opened_with and not _is_json(self.path(CONFIG)):
             save_json(self.path(CONFIG), self.opened_with)
@@ -153,14 +154,12 @@ class Stage:
             if other:
                 begun = f"{self.directory} was begun in another environment ({other})"
                 print(f"warning: {begun}; bits may differ", file=sys.stderr)
-        start = round(time.time(), 3)
-        now = {"command": command(), **here, "start": start, "seconds": None}
+        now = {"command": command(), **here, "start": round(time.time(), 3), "seconds": None}
         save_json(self.path(MADE), [*sessions, now])
-        return start
 
-    def _end(self, begun: float) -> None:
+    def _end(self, seconds: float) -> None:
         *before, now = self.made
-        save_json(self.path(MADE), [*before, now | {"seconds": round(time.time() - begun, 1)}])
+        save_json(self.path(MADE), [*before, now | {"seconds": round(seconds, 1)}])
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Marks the stage as finished; must be the last write to it."""
@@ -192,6 +191,24 @@ class Stage:
         """Removes all checkpoints."""
         with disk(self.directory):
             remove(self.path("checkpoints"))
+
+
+# Seconds of finished work inside each piece of work that is under way, the innermost last.
+_INSIDE: list[float] = []
+
+
+@contextlib.contextmanager
+def _timed() -> Iterator[list[float]]:
+    """Yields a list that holds, after the block, its seconds without those of stages inside it."""
+    seconds, begun = list[float](), time.monotonic()
+    _INSIDE.append(0.0)
+    try:
+        yield seconds
+    finally:
+        total = time.monotonic() - begun
+        seconds.append(total - _INSIDE.pop())
+        if _INSIDE:
+            _INSIDE[-1] += total
 
 
 @functools.cache

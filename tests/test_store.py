@@ -82,6 +82,18 @@ def test_a_stage_says_who_made_it_and_how_long_it_took(tmp_path: Path, monkeypat
     assert abs(session["start"] - time.time()) < 60
 
 
+def test_the_time_of_a_stage_is_without_that_of_stages_inside(tmp_path: Path) -> None:
+    test, fit = (Stage.open(tmp_path, name, {}) for name in ("test", "fit"))
+
+    def work() -> dict[str, Any]:
+        fit.run_once(lambda: time.sleep(1.0) or {})
+        time.sleep(0.3)
+        return {}
+
+    test.run_once(work)
+    assert 1.0 <= fit.made[0]["seconds"] < 1.3 and 0.3 <= test.made[0]["seconds"] < 0.6
+
+
 OLD, NEW = {"genidm.paper.fit": "aaaa"}, {"genidm.paper.fit": "bbbb"}
 
 
