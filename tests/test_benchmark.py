@@ -30,7 +30,7 @@ from genidm.paper.methods import GE, LR
 from genidm.robots import Ant
 from genidm.robots.mujoco import Solver
 
-KEYS = ["name", "value", "unit", "ratio_to", "ratio", "hardware"]
+KEYS = ["name", "value", "unit", "ratio_to", "ratio", "hardware", "commit", "command"]
 
 
 @pytest.fixture
@@ -214,7 +214,9 @@ def test_table():
         ("raw (8 lanes)", 12345.6, "steps/s", None, None),
         ("PPO (8 lanes)", 61.72, "steps/s", "raw (8 lanes)", 0.005),
     ]
-    results = [dict(zip(KEYS, (*row, "a machine"), strict=True)) for row in rows]
+    results = [
+        dict(zip(KEYS, (*row, "a machine", "a" * 40, "a command"), strict=True)) for row in rows
+    ]
     assert comparing.table(results).splitlines() == [
         "row             value  unit     ratio  to",
         "─" * 42,

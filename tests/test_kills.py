@@ -121,7 +121,8 @@ def run_killed(out: Path, points: list[str]) -> None:
             os._exit(0)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         if point:
-            print(point, "killed" if status == -signal.SIGKILL else status, sep=":")
+            said = "killed" if status == -signal.SIGKILL else status
+            print(point, said, sep=":", flush=True)  # or a child would print it again
         elif status:
             sys.exit(status)
 

@@ -11,9 +11,8 @@ from typing import Annotated, Any
 import pytest
 import tyro
 
-from experiments import physics, waypoints
+from experiments import physics, table1, waypoints
 from experiments.benchmark.bench import Options
-from experiments.table1 import table1
 from genidm.errors import BadInput
 from genidm.paper.methods import HUMANOID, LR, VGCP, by_name
 from genidm.renamed import RENAMED, refuse
@@ -30,7 +29,7 @@ def benchmark(
 COMMANDS: list[Callable[..., Any]] = [
     *(_settings(method) for method in (LR, VGCP, by_name("HER_SP"), by_name("HER_DE"))),
     *(_settings(method) for method in HUMANOID if method.name in ("RL", "HER_SP")),
-    table1, waypoints.main, video.main, benchmark, physics.physics,
+    table1.main, waypoints.main, video.main, benchmark, physics.physics,
 ]  # fmt: skip
 # Agents that no method freezes have settings that stand below two dots on no command line.
 FROZEN_ALONE = {"epochs", "minibatches", "gae", "clip", "entropy", "value-hidden", "max-gradient",
@@ -98,6 +97,6 @@ def test_a_command_with_files_to_write_keeps_its_out() -> None:
 def test_the_command_line_ends_in_a_sentence(monkeypatch, capsys, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["table1", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
-        run_cli(table1, "")
+        run_cli(table1.main, "")
     assert ended.value.code == 2
     assert capsys.readouterr().err == "error: --out is now called --run-dir\n"
