@@ -10,8 +10,8 @@ import tyro
 from genidm.evaluation import sanity
 from genidm.evaluation.evaluate import EvaluationSettings, evaluate
 from genidm.evaluation.scenarios import scenarios
-from genidm.provenance import code_of, command, environment
-from genidm.report import Row, origin, results, text
+from genidm.report import Row, results, text
+from genidm.report.rows import origin_now
 from genidm.runs.cell import load_runs
 from genidm.runs.command import run_cli
 from genidm.runs.run import TEST
@@ -40,8 +40,7 @@ def main(
     """
     robot, models = load_runs(runs, engine)
     test_scenarios, rows = scenarios(robot, seeds, episodes, first_seed), []
-    here = {**environment(), "command": command()}
-    tested = origin(code_of(*TEST, robot, robot.engine), [here])
+    tested = origin_now(*TEST, robot, robot.engine)
     for name, (model, fitted) in models.items():
         outcome = evaluate(robot, model, test_scenarios, test)
         sanity.walked(name, outcome)

@@ -16,9 +16,8 @@ from genidm.evaluation import stats
 from genidm.evaluation.scenarios import Scenarios
 from genidm.paper import methods
 from genidm.paper.methods import InverseDynamics
-from genidm.provenance import code_digest
 from genidm.report.figures import latent_sizes
-from genidm.report.rows import jsonable
+from genidm.report.rows import digested, jsonable
 from genidm.report.runs import Tested
 from genidm.robots import Robot, by_name
 from genidm.runs.cell import announce, make_run, render_run, scenarios_of
@@ -92,8 +91,7 @@ def run(robot: Robot, method: InverseDynamics, options: Sweep) -> Path:
     }
     tests = {k: [test.episodes for test in of_k] for k, of_k in found.items()}
     written = document(first, method.fit.latent_size, scenarios, found)
-    engine = [robot.engine_name] if robot.engine_name and len(robot.engines) > 1 else []
-    here = first.root / "-".join([KIND, first.scale.name, *engine])
+    here = first.root / "-".join([KIND, first.scale.name, *robot.engine_in_names])
     for directory in (here, options.report_dir):
         if directory:
             files.save_json(Path(directory) / f"{robot.name}_{KIND}.json", written)
@@ -149,7 +147,7 @@ def size(fits: list[Tested]) -> dict[str, Any]:
 
 def made_by(test: Tested) -> dict[str, Any]:
     """Stage → what made it, with the digest of its code."""
-    return {name: o | {"code": code_digest(o["code"])} for name, o in test.made.items()}
+    return {name: digested(o) for name, o in test.made.items()}
 
 
 def text(written: dict[str, Any]) -> str:

@@ -105,8 +105,7 @@ def _method(row: Row) -> dict[str, Any]:
     if row.invariance is not None:
         record["invariance"] = float(f"{row.invariance:.3g}")
     if row.made:
-        made = {name: {**o, "code": code_digest(o["code"])} for name, o in row.made.items()}
-        record["made"] = jsonable(made)
+        record["made"] = {name: digested(o) for name, o in row.made.items()}
     return record
 
 
@@ -131,6 +130,12 @@ def origin(code: Mapping[str, str], sessions: Sequence[Mapping[str, Any]]) -> di
     }
 
 
+def digested(made: Mapping[str, Any]) -> dict[str, Any]:
+    """An `origin` as JSON keeps it: with the digest of its code in place of the modules."""
+    brief: dict[str, Any] = jsonable({**made, "code": code_digest(made["code"])})
+    return brief
+
+
 def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
     """Modules whose code differs between the rows: module → digest → methods."""
     found: dict[str, dict[str, list[str]]] = {}
@@ -142,14 +147,18 @@ def _other_code(rows: Sequence[Row]) -> dict[str, dict[str, list[str]]]:
     return {module: digests for module, digests in found.items() if len(digests) > 1}
 
 
-def made_now(*code: Any) -> dict[str, Any]:
-    """What makes a result in this process: the `origin` of its command, and its code's digest.
+def origin_now(*code: Any) -> dict[str, Any]:
+    """The `origin` of a result of this process.
 
     Args:
       code: modules or objects that the result depends on (`provenance.code_of`).
     """
-    made = origin(code_of(*code), [{**environment(), "command": command()}])
-    return {**made, "code": code_digest(made["code"])}
+    return origin(code_of(*code), [{**environment(), "command": command()}])
+
+
+def made_now(*code: Any) -> dict[str, Any]:
+    """`origin_now`, `digested`."""
+    return digested(origin_now(*code))
 
 
 def _compared(rows: Sequence[Row]) -> Iterator[tuple[Row, Row]]:

@@ -55,11 +55,12 @@ def report(
     shown = gather(runs)
     rows = [runs.row(name, shown.invariance(name)) for name in runs.found]
     written = _document(runs, rows, scale)
-    engine = [robot.engine_name] if robot.engine_name and len(robot.engines) > 1 else []
-    here = root / "-".join(["report", scale, *engine])
+    here = root / "-".join(["report", scale, *robot.engine_in_names])
     _write(here, "", "results.json", written, rows, shown)
     if results:
-        name = "_".join([robot.name, *engine, *([scale] if scale != "paper" else [])])
+        name = "_".join(
+            [robot.name, *robot.engine_in_names, *([scale] if scale != "paper" else [])]
+        )
         _write(results, f"{name}_", f"{name}.json", written, rows, shown)
     return here
 

@@ -145,6 +145,11 @@ class Robot(abc.ABC):
         """Name of the engine, the value of `--engine`; None if the robot steps itself."""
         return self.engine.name if self.engine else None
 
+    @property
+    def engine_in_names(self) -> list[str]:
+        """The engine's name, for names of files of several engines; empty if there is only one."""
+        return [self.engine.name] if self.engine and len(self.engines) > 1 else []
+
     def mesh(self) -> Mesh:
         """The jax devices that share the lanes by default."""
         return self.engine.mesh() if self.engine else devices.mesh()
