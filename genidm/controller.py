@@ -15,7 +15,7 @@ from genidm.agents.policy import Policy, described
 from genidm.checks import WIDEST, check_value, count, layers, one_of, optional, shown
 from genidm.config import to_json
 from genidm.errors import BadInput
-from genidm.paper.idm import Architecture
+from genidm.paper.idm import NETWORKS, Architecture
 from genidm.robots import Robot, by_name
 
 Frame = Literal["world", "heading"]
@@ -118,15 +118,17 @@ class Controller(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the models is invalid.
         """
+        meta = {"network": "mlp"} | meta  # older files name no network
         for name, allowed in (
             ("action_size", count(robot.action.size, robot.action.size)),
             ("idm", layers), ("lfm", layers), ("latent_size", optional(count(1, WIDEST))),
-            ("input_frame", one_of(get_args(Frame))),
+            ("input_frame", one_of(get_args(Frame))), ("network", one_of(NETWORKS)),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         architecture = Architecture(
-            meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
-        )
+            meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"],
+            meta["network"],
+        )  # fmt: skip
         return cls(**tree, architecture=architecture, input_frame=meta["input_frame"], robot=robot)
 
 

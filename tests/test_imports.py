@@ -58,6 +58,8 @@ report
 paper.methods
 runs.scale
 runs.resolve runs.run
+runs.recording
+runs.fitting runs.policies
 report.runs
 report.shown
 report.write

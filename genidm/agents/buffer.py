@@ -15,14 +15,14 @@ import jax.numpy as jnp
 
 from genidm.errors import BadInput
 from genidm.robots.base import Robot
-from genidm.tasks import Transition
+from genidm.tasks import Transition, seen
 
 
 class ReplayTransition(flax.struct.PyTreeNode):
     """Stored steps `[...]`; the state after a step is s of the next row.
 
     Attributes:
-      s: `[..., S]`, state before the step.
+      s: `[..., S]`, state before the step, as the policy sees it.
       o: `[..., 3]`, position before the step, metres, world frame.
       o_next: `[..., 3]`, position after the step, before any reset.
       a: `[..., A]`, action.
@@ -53,7 +53,7 @@ class ReplayTransition(flax.struct.PyTreeNode):
 def to_replay_transition(robot: Robot, step: Transition) -> ReplayTransition:
     """Convert one transition of B lanes to what the buffer stores, `[B, ...]`."""
     return ReplayTransition(
-        s=step.before.observation,
+        s=seen(robot, step.before.observation, step.forward),
         o=step.before.position,
         o_next=step.after.position,
         a=step.action,

@@ -46,6 +46,11 @@ def described(robot: Robot) -> dict[str, Any]:
     }
 
 
+def bearing(relative_goal: jax.Array) -> jax.Array:
+    """Direction `[...]` of relative goals `[..., 3]` in the world, radians from +x."""
+    return jnp.arctan2(relative_goal[..., 1], relative_goal[..., 0])
+
+
 class Policy(flax.struct.PyTreeNode):
     """The mean action of a trained policy network, squashed by tanh.
 
@@ -57,6 +62,8 @@ class Policy(flax.struct.PyTreeNode):
       activation: activation of the hidden layers.
       goal_conditioned: whether the input is (s, g − o); if not, it is s.
       robot: the robot that the policy controls.
+      faces_goal: whether s is first rotated so that +x points at the goal. So a policy that walks
+        towards +x walks to the goal, without any fit.
     """
 
     params: Any
@@ -66,6 +73,7 @@ class Policy(flax.struct.PyTreeNode):
     activation: Activation = flax.struct.field(pytree_node=False)
     goal_conditioned: bool = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
+    faces_goal: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` for states `[..., S]` and relative goals `[..., 3]`, metres.
@@ -74,6 +82,8 @@ class Policy(flax.struct.PyTreeNode):
           BadInput: the shapes do not fit the robot or each other, or a number is not finite.
         """
         s = self.robot.check_inputs(s, relative_goal)
+        if self.faces_goal:
+            s = self.robot.observation.rotate(s, -bearing(relative_goal))
         x = inputs(s, relative_goal if self.goal_conditioned else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
         out = self._network().apply(self.params, x)
@@ -111,6 +121,7 @@ class Policy(flax.struct.PyTreeNode):
             "policy_hidden_layer_sizes": self.policy_hidden_layer_sizes,
             "activation": self.activation,
             "goal_conditioned": self.goal_conditioned,
+            "faces_goal": self.faces_goal,
         }
         files.save_arrays(path, leaves, meta, overwrite)
 
@@ -121,9 +132,10 @@ class Policy(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the network is not valid.
         """
+        meta = {"faces_goal": False} | meta  # older files do not name it
         for name, allowed in (
             ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),
-            ("goal_conditioned", one_of((False, True))),
+            ("goal_conditioned", one_of((False, True))), ("faces_goal", one_of((False, True))),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         return cls(
@@ -132,4 +144,5 @@ class Policy(flax.struct.PyTreeNode):
             activation=meta["activation"],
             goal_conditioned=meta["goal_conditioned"],
             robot=robot,
+            faces_goal=meta["faces_goal"],
         )

@@ -16,7 +16,7 @@ from genidm.checks import WIDEST, check, count, layers, number, optional, positi
 from genidm.controller import Controller, Frame, in_frame
 from genidm.errors import BadInput
 from genidm.paper import protocol
-from genidm.paper.idm import Architecture, loss_plain, loss_siamese
+from genidm.paper.idm import Architecture, Network, loss_plain, loss_siamese
 from genidm.paper.pairs import Pairs
 from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot
@@ -41,6 +41,9 @@ class Fit:
       cosine_decay: reduce the learning rate to 0 along a cosine; False keeps it constant (A.1.2).
       idm: hidden layers of φ (Table 2).
       lfm: hidden layers of ψ (Table 2).
+      network: "mlp": fully connected layers (Table 2); "residual": a block with layer
+        normalisation in place of each layer.
+      weight_decay: of AdamW; 0 is the paper's Adam.
       latent_size: k (Eq. 3); None fits an IDM without an LFM.
       latent_loss_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
       mean_latent: fit φ to the mean of a pair's latents (Eq. 6); False fits it to each latent.
@@ -53,6 +56,8 @@ class Fit:
     cosine_decay: bool = True
     idm: tuple[int, ...] = (256, 256)
     lfm: tuple[int, ...] = (256, 256)
+    network: Network = "mlp"
+    weight_decay: float = 0.0
     latent_size: int | None = None
     latent_loss_weight: float = protocol.LATENT_WEIGHT
     mean_latent: bool = True
@@ -66,16 +71,22 @@ class Fit:
             learning_rate=positive(),
             idm=layers,
             lfm=layers,
+            weight_decay=number(0),
             latent_size=optional(count(1, WIDEST)),
             latent_loss_weight=number(0, 1, above=True, below=True),
         )
+        for name in ("idm", "lfm") if self.network == "residual" else ():
+            if len(set(sizes := getattr(self, name))) != 1:
+                raise BadInput(f"{name}: residual blocks are all of one width, not {sizes}")
 
     def optimizer(self) -> optax.GradientTransformation:
-        """Make Adam with the learning rate schedule."""
-        rate = self.learning_rate
-        return optax.adam(
-            optax.cosine_decay_schedule(rate, self.updates) if self.cosine_decay else rate
-        )
+        """Make Adam, or AdamW, with the learning rate schedule."""
+        rate: optax.ScalarOrSchedule = self.learning_rate
+        if self.cosine_decay:
+            rate = optax.cosine_decay_schedule(self.learning_rate, self.updates)
+        if self.weight_decay:
+            return optax.adamw(rate, weight_decay=self.weight_decay)
+        return optax.adam(rate)
 
 
 def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:
@@ -199,7 +210,9 @@ def _start(
     robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, input_frame: Frame
 ) -> FitState:
     params, stream = jax.random.split(key)
-    architecture = Architecture(robot.action.size, settings.idm, settings.lfm, settings.latent_size)
+    architecture = Architecture(
+        robot.action.size, settings.idm, settings.lfm, settings.latent_size, settings.network
+    )
     mean, std = jax.jit(lambda s: (s.mean((0, 1)), s.std((0, 1))))(samples.s)
     model = Controller(
         params=architecture.init(params, robot.observation.size),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -20,6 +20,7 @@ from genidm.robots.base import Robot
 
 # A warning is shown if less than this fraction of the record can be learned from.
 FEW = 0.25
+Labels = Literal["performed", "intended"]
 # d rotates and mirrors by the same rules as the fields of a layout.
 DIRECTION = symmetry.vector("direction", unit="1")
 
@@ -48,6 +49,7 @@ def pairs(
     *,
     goal_horizon: int = 100,
     mirror: bool = False,
+    labels: Labels = "performed",
 ) -> Pairs:
     """Make the samples of a fit: the record, its rotated copies, and their reflections.
 
@@ -59,10 +61,11 @@ def pairs(
         position". Steps whose episode ends earlier are left out. If o' lies after the end
         of a replayed segment, the rotated o' of the record is used.
       mirror: add the reflection y → −y of every sample, in every view.
+      labels: the actions of the samples: "performed", or "intended", before exploration.
 
     Raises:
       BadInput: goal_horizon is not a whole number ≥ 1, or is longer than every episode, or
-        the record is invalid.
+        the record is invalid, or it has no intended actions.
     """
     check_value("goal_horizon", goal_horizon, count())
     experience = experience.prepared(robot)
@@ -85,8 +88,15 @@ def pairs(
             f"no episode lasts goal_horizon = {goal_horizon} steps: reduce it "
             "(--method.goal-horizon), or collect more (--scale)"
         )
-    out = _samples(views, experience.a, valid)
+    out = _samples(views, _labels(experience, labels), valid)
     return with_reflection(robot, out) if mirror else out
+
+
+def _labels(experience: Experience, labels: Labels) -> np.ndarray:
+    a = experience.a if labels == "performed" else experience.intended
+    if a is None:
+        raise BadInput('this record has no intended actions: use the labels "performed"')
+    return np.asarray(a)
 
 
 def _warn_of_invalid_steps(experience: Experience) -> None:
