@@ -355,7 +355,7 @@ def record(step: Transition, intended: jax.Array | None = None) -> Experience:
         valid=~step.after.diverged,
         physics=step.before.physics,
         intended=intended,
-        forward=step.forward,
+        forward=step.view.forward,
     )
 
 

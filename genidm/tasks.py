@@ -15,11 +15,46 @@ import jax
 import jax.numpy as jnp
 
 from genidm.checks import check, count, number, positive
+from genidm.errors import BadInput
 from genidm.paper.protocol import TARGET_BEARING
 from genidm.robots.base import Robot, State
-from genidm.symmetry import horizontal_norm, vector, wrap
+from genidm.symmetry import horizontal_norm, quarters_to, vector, wrap
 
 RELATIVE_GOAL = vector("relative goal")
+
+
+class View(flax.struct.PyTreeNode):
+    """How a policy sees robots `[B]`, and what its actions mean.
+
+    Attributes:
+      forward: `[B]`, radians, the direction in the world that the policy sees as +x; None: +x.
+      nearest_side: whether the policy sees the side of the body that is nearest to +x as its front
+        (for a body with four equal sides).
+    """
+
+    forward: Any = None
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
+
+    def state(self, robot: Robot, robots: State) -> jax.Array:
+        """s `[B, S]` as the policy sees it."""
+        s = robots.observation
+        if self.forward is not None:
+            s = robot.observation.rotate(s, -self.forward)
+        if self.nearest_side:
+            s = robot.observation.turn_body_by(s, self._quarters(robots))
+        return s
+
+    def seen_action(self, robot: Robot, robots: State, a: jax.Array) -> jax.Array:
+        """The policy's action `[B, A]` for the robot's action `a [B, A]`."""
+        return robot.action.turn_body_by(a, self._quarters(robots)) if self.nearest_side else a
+
+    def robot_action(self, robot: Robot, robots: State, a: jax.Array) -> jax.Array:
+        """The robot's action `[B, A]` for the policy's action `a [B, A]`."""
+        return robot.action.turn_body_by(a, -self._quarters(robots)) if self.nearest_side else a
+
+    def _quarters(self, robots: State) -> jax.Array:
+        forward = jnp.zeros_like(robots.heading) if self.forward is None else self.forward
+        return quarters_to(forward, robots.heading)
 
 
 class EnvState(flax.struct.PyTreeNode):
@@ -30,14 +65,14 @@ class EnvState(flax.struct.PyTreeNode):
       episode_step: `[B]` int32, steps since the episode began.
       keys: `[B]`, one random key per lane, so that results do not depend on sharding.
       goal: `[B, 3]`, metres, world frame; None if the task has no goals.
-      forward: `[B]`, radians, the direction in the world that the policy sees as +x; None: +x.
+      view: how the policy sees the robots.
     """
 
     robots: State
     episode_step: jax.Array
     keys: jax.Array
     goal: Any = None
-    forward: Any = None
+    view: View = View()
 
     @property
     def relative_goal(self) -> Any:
@@ -46,7 +81,7 @@ class EnvState(flax.struct.PyTreeNode):
 
     def inputs(self, robot: Robot) -> jax.Array:
         """The input `[B, I]` of a policy in this state."""
-        return inputs(seen(robot, self.robots.observation, self.forward), self.relative_goal)
+        return inputs(self.view.state(robot, self.robots), self.relative_goal)
 
 
 class Outcome(NamedTuple):
@@ -72,7 +107,7 @@ class Transition(flax.struct.PyTreeNode):
       action: a `[B, A]`.
       after: State `[B]` after the step.
       goal: `[B, 3]`, metres, world frame; None if the task has no goals.
-      forward: `[B]`, see `EnvState`.
+      view: how the policy saw the robots before the step.
       reward: `[B]`.
       absorbing_reward: `[B]`, see `Outcome`.
       episode_step: `[B]` int32, steps of the episode before this step.
@@ -84,7 +119,7 @@ class Transition(flax.struct.PyTreeNode):
     action: jax.Array
     after: State
     goal: Any
-    forward: Any
+    view: View
     reward: jax.Array
     absorbing_reward: jax.Array
     episode_step: jax.Array
@@ -99,7 +134,7 @@ class Transition(flax.struct.PyTreeNode):
     def inputs(self, robot: Robot) -> jax.Array:
         """The input `[B, I]` of the policy before the step."""
         goal = None if self.goal is None else self.goal - self.before.position
-        return inputs(seen(robot, self.before.observation, self.forward), goal)
+        return inputs(self.view.state(robot, self.before), goal)
 
 
 class Task(Protocol):
@@ -107,9 +142,11 @@ class Task(Protocol):
 
     Attributes:
       goal_conditioned: whether the task has goals.
+      nearest_side: see `View`.
     """
 
     goal_conditioned: ClassVar[bool]
+    nearest_side: bool = False
 
     def start(self, robot: Robot, keys: jax.Array) -> EnvState:
         """EnvState `[B]` at the start of new episodes, from keys `[B]`."""
@@ -145,12 +182,15 @@ class WalkForward(Task):
         episode starts facing +x.
       turn_rate: probability per step that the world turns. 0, as in the paper: it never turns.
       turn_spread: radians; after a turn, +x is uniform in ± this value about the robot's heading.
+      nearest_side: the policy sees the side of the body that is nearest to +x as its front, so
+        that it need not turn by more than 45°. Only for a body with four equal sides (the Ant).
     """
 
     episode_steps: int = 1000
     start_yaw: float = 0.0
     turn_rate: float = 0.0
     turn_spread: float = 1.0
+    nearest_side: bool = False
     goal_conditioned: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -159,9 +199,12 @@ class WalkForward(Task):
         check(self, turn_rate=number(0, 1))
 
     def start(self, robot: Robot, keys: jax.Array) -> EnvState:
+        if self.nearest_side and not robot.can_turn_body:
+            raise BadInput(f"nearest_side needs a body with four equal sides, not the {robot.name}")
         robots, streams = _fresh(robot, keys, self.start_yaw)
         forward = jnp.zeros_like(robots.heading) if self.turn_rate else None
-        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams, forward=forward)
+        view = View(forward, self.nearest_side)
+        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams, view=view)
 
     def draw(self, key: jax.Array) -> Any:
         """Two uniform numbers, in [0, 1) for when and in [−1, 1) for how far the world turns."""
@@ -179,12 +222,13 @@ class WalkForward(Task):
             return lanes
         when, far = numbers
         turned = wrap(lanes.robots.heading + self.turn_spread * far)
-        return lanes.replace(forward=jnp.where(when < self.turn_rate, turned, lanes.forward))
+        forward = jnp.where(when < self.turn_rate, turned, lanes.view.forward)
+        return lanes.replace(view=lanes.view.replace(forward=forward))
 
     def transition(
         self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
     ) -> Transition:
-        speed = _forward_speed(robot, lanes.robots, after, lanes.forward)
+        speed = _forward_speed(robot, lanes.robots, after, lanes.view.forward)
         terminal = after.fallen | after.diverged
         reward = speed + robot.healthy_reward * ~terminal - robot.cost(after, action)
         outcome = Outcome(reward, terminal, jnp.zeros_like(reward))
@@ -192,7 +236,7 @@ class WalkForward(Task):
 
     def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """Forward speed in m/s, reward, falls, divergences."""
-        speed = _forward_speed(robot, step.before, step.after, step.forward)
+        speed = _forward_speed(robot, step.before, step.after, step.view.forward)
         return {"speed": speed} | _common(step)
 
 
@@ -373,7 +417,7 @@ def to_transition(
         action=action,
         after=after,
         goal=lanes.goal,
-        forward=lanes.forward,
+        view=lanes.view,
         reward=outcome.reward,
         absorbing_reward=outcome.absorbing_reward,
         episode_step=lanes.episode_step,
@@ -390,11 +434,6 @@ def _common(step: Transition) -> dict[str, jax.Array]:
     }
 
 
-def seen(robot: Robot, s: jax.Array, forward: Any) -> jax.Array:
-    """s `[..., S]` in the frame whose +x is the direction `forward [...]`, radians (None: +x)."""
-    return s if forward is None else robot.observation.rotate(s, -forward)
-
-
 def inputs(s: jax.Array, relative_goal: Any) -> jax.Array:
     """The input of a policy: s `[..., S]`, or (s, g − o) `[..., S + 3]` with a goal."""
     return s if relative_goal is None else jnp.concatenate([s, relative_goal], axis=-1)
@@ -403,7 +442,7 @@ def inputs(s: jax.Array, relative_goal: Any) -> jax.Array:
 def mirror_inputs(robot: Robot, x: jax.Array) -> jax.Array:
     """The input `[..., I]` of a policy after the reflection y → −y."""
     s, relative_goal = jnp.split(x, [robot.observation.size], axis=-1)
-    goal = None if not relative_goal.shape[-1] else RELATIVE_GOAL.mirror(relative_goal)
+    goal = RELATIVE_GOAL.mirror(relative_goal) if relative_goal.shape[-1] else None
     return inputs(robot.observation.mirror(s), goal)
 
 

@@ -85,13 +85,13 @@ def test_the_robot_makes_the_steps_that_are_recorded(name: str) -> None:
     after = jax.jit(ROBOT.step)(flat.before, flat.action)
     close(after.position, flat.after.position, atol=1e-6)
     keys = jax.random.split(jax.random.key(0), len(flat.episode_step))
-    lanes = EnvState(flat.before, flat.episode_step, keys, flat.goal, flat.forward)
+    lanes = EnvState(flat.before, flat.episode_step, keys, flat.goal, view=flat.view)
     anew = TASKS[name].transition(ROBOT, lanes, flat.action, flat.after)
     close(anew.reward, flat.reward, atol=1e-5)
     assert (np.asarray(anew.last) == np.asarray(flat.last)).all()
     np.testing.assert_array_equal(record.a, step.action)
     np.testing.assert_array_equal(record.intended, 0.5 * step.action)
-    if step.forward is None:
+    if step.view.forward is None:
         np.testing.assert_array_equal(fed[..., : record.s.shape[-1]], record.s)
     assert metrics["reward"].shape == (STEPS, LANES)
 
@@ -99,22 +99,22 @@ def test_the_robot_makes_the_steps_that_are_recorded(name: str) -> None:
 def test_the_world_turns_about_the_robot_and_the_record_does_not() -> None:
     _, record, (step, fed), metrics = walked("turning")
     going = ~step.last[:-1]
-    turned = going & (step.forward[1:] != step.forward[:-1])
+    turned = going & (step.view.forward[1:] != step.view.forward[:-1])
     assert 0.7 * RATE < turned.sum() / going.sum() < 1.3 * RATE
-    after_start = np.where(step.episode_step == 0, step.forward, 0)
+    after_start = np.where(step.episode_step == 0, step.view.forward, 0)
     assert not after_start.any()  # an episode starts with +x as forward
-    relative = np.asarray(symmetry.wrap(step.forward[1:] - step.after.heading[:-1]))[turned]
+    relative = np.asarray(symmetry.wrap(step.view.forward[1:] - step.after.heading[:-1]))[turned]
     assert np.abs(relative).max() <= SPREAD + 1e-5
     assert relative.min() < -0.8 * SPREAD and relative.max() > 0.8 * SPREAD
     # The policy sees the robot in the turned world; the record holds it in the true one.
-    heading = symmetry.wrap(step.before.heading - step.forward)
+    heading = symmetry.wrap(step.before.heading - step.view.forward)
     close(ROBOT.observation.yaw(fed), heading, atol=1e-5)
     close(ROBOT.observation.yaw(record.s), step.before.heading, atol=1e-5)
-    np.testing.assert_array_equal(record.forward, step.forward)
+    np.testing.assert_array_equal(record.forward, step.view.forward)
     np.testing.assert_array_equal(record.o[1:][going], record.o_next[:-1][going])
     # It is paid for the speed along the forward direction of the step.
     way = (record.o_next - record.o)[..., :2]
-    ahead = np.stack([np.cos(step.forward), np.sin(step.forward)], axis=-1)
+    ahead = np.stack([np.cos(step.view.forward), np.sin(step.view.forward)], axis=-1)
     speed = (way * ahead).sum(-1) / ROBOT.dt
     close(metrics["speed"], speed, atol=1e-4)
     close(step.reward, speed + 1 - ROBOT.cost(step.after, step.action), atol=1e-4)

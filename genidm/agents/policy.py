@@ -19,6 +19,7 @@ from flax import linen
 from genidm import files
 from genidm.checks import check_value, layers, one_of
 from genidm.robots.base import Robot
+from genidm.symmetry import quarters_to
 from genidm.tasks import inputs
 
 Activation = Literal["tanh", "relu"]
@@ -64,6 +65,8 @@ class Policy(flax.struct.PyTreeNode):
       robot: the robot that the policy controls.
       faces_goal: whether s is first rotated so that +x points at the goal. So a policy that walks
         towards +x walks to the goal, without any fit.
+      nearest_side: whether the side of the body that is nearest to +x counts as its front
+        (`genidm.tasks.WalkForward`).
     """
 
     params: Any
@@ -74,6 +77,7 @@ class Policy(flax.struct.PyTreeNode):
     goal_conditioned: bool = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
     faces_goal: bool = flax.struct.field(pytree_node=False, default=False)
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` for states `[..., S]` and relative goals `[..., 3]`, metres.
@@ -84,6 +88,15 @@ class Policy(flax.struct.PyTreeNode):
         s = self.robot.check_inputs(s, relative_goal)
         if self.faces_goal:
             s = self.robot.observation.rotate(s, -bearing(relative_goal))
+        if not self.nearest_side:
+            return self._action(s, relative_goal)
+        heading = self.robot.observation.yaw(s)
+        quarters = quarters_to(jnp.zeros_like(heading), heading)
+        action = self._action(self.robot.observation.turn_body_by(s, quarters), relative_goal)
+        return self.robot.action.turn_body_by(action, -quarters)
+
+    def _action(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        """The output `[..., A]` of the network, squashed."""
         x = inputs(s, relative_goal if self.goal_conditioned else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
         out = self._network().apply(self.params, x)
@@ -122,6 +135,7 @@ class Policy(flax.struct.PyTreeNode):
             "activation": self.activation,
             "goal_conditioned": self.goal_conditioned,
             "faces_goal": self.faces_goal,
+            "nearest_side": self.nearest_side,
         }
         files.save_arrays(path, leaves, meta, overwrite)
 
@@ -132,10 +146,11 @@ class Policy(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the network is not valid.
         """
-        meta = {"faces_goal": False} | meta  # older files do not name it
+        meta = {"faces_goal": False, "nearest_side": False} | meta  # not in older files
+        either = one_of((False, True))
         for name, allowed in (
             ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),
-            ("goal_conditioned", one_of((False, True))), ("faces_goal", one_of((False, True))),
+            ("goal_conditioned", either), ("faces_goal", either), ("nearest_side", either),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         return cls(
@@ -145,4 +160,5 @@ class Policy(flax.struct.PyTreeNode):
             goal_conditioned=meta["goal_conditioned"],
             robot=robot,
             faces_goal=meta["faces_goal"],
+            nearest_side=meta["nearest_side"],
         )

@@ -71,9 +71,10 @@ def generate_unroll(
     carry = _Carry(lanes.replace(keys=keys[:, 0]), fresh, jnp.zeros(lanes.episode_step.shape, bool))
 
     def act(carry: _Carry, row: Any) -> tuple[Any, jax.Array, Any]:
-        drawn, task_numbers = row
-        action, intended, notes = choose(carry.lanes.inputs(robot), drawn)
-        return carry.lanes.robots, action, (intended, notes, task_numbers)
+        lanes, (drawn, task_numbers) = carry.lanes, row
+        *actions, notes = choose(lanes.inputs(robot), drawn)
+        action, intended = (lanes.view.robot_action(robot, lanes.robots, a) for a in actions)
+        return lanes.robots, action, (intended, notes, task_numbers)
 
     def watch(carry: _Carry, move: Move) -> tuple[_Carry, Any]:
         intended, notes, task_numbers = move.notes
