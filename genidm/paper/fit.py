@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+from tqdm.auto import tqdm
 
-from genidm import devices, trees
+from genidm import devices, symmetry, trees
 from genidm.checks import WIDEST, check, count, layers, number, optional, positive
-from genidm.controller import Controller, Frame, in_frame
+from genidm.controller import Controller, Frame, in_frame, relative_bearing
 from genidm.errors import BadInput
 from genidm.paper import protocol
 from genidm.paper.idm import Architecture, Network, loss_plain, loss_siamese
@@ -23,6 +26,8 @@ from genidm.robots.base import Robot
 from genidm.store import Stage
 
 STD_FLOOR = 1e-2
+# The quantiles of the bearing of d that a controller keeps.
+QUANTILES = (0.01, 0.99)
 # A minibatch of this size takes 3 GB for the Ant: two views through two layers of 256.
 MOST_IN_BATCH = 1 << 20
 
@@ -151,6 +156,10 @@ def fit(
     )
     samples = jax.jit(functools.partial(_in_input_frame, robot, input_frame))(samples)
     state, updates = training(robot, samples, key, settings, input_frame)
+    if not quiet:
+        low, high = np.degrees(state.model.bearings).round()
+        said = f"98 % of d lie between {low:.0f}° and {high:.0f}° of the heading"
+        tqdm.write(f"fit: {said}".replace("-", "−"), file=sys.stderr)
     checkpoints = stage.checkpoints() if stage else None
     found = checkpoints.latest(state) if checkpoints else None
     done, state = (found[0], _on_device_of(samples, found[1])) if found else (0, state)
@@ -221,9 +230,25 @@ def _start(
         architecture=architecture,
         input_frame=input_frame,
         robot=robot,
+        bearings=_bearings(robot, samples),
     )
     optimizer = settings.optimizer().init(model.params)
     return _on_device_of(samples, FitState(model, optimizer, stream, jnp.zeros((), jnp.int32)))
+
+
+def _bearings(robot: Robot, samples: Pairs) -> np.ndarray:
+    """Measure `Controller.bearings`; the views of a sample have one bearing, so one view counts.
+
+    The quantiles are taken of the angle to the mean direction, so that they do not depend on
+    where the circle is cut. A range that crosses ±π becomes the full circle.
+    """
+    angle = np.asarray(
+        jax.jit(lambda x: relative_bearing(robot, x.s[0], x.d[0]))(samples), np.float64
+    )
+    centre = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean())
+    low, high = centre + np.quantile(np.asarray(symmetry.wrap(angle - centre)), QUANTILES)
+    known = -np.pi <= low and high <= np.pi
+    return np.array([low, high] if known else [-np.pi, np.pi], np.float32)
 
 
 def _updates(settings: Fit) -> Any:

@@ -70,6 +70,8 @@ class InverseDynamics(Method):
       mirror: add the reflection of every sample; not in the paper.
       input_frame: "heading" rotates every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
+      clip_bearing: at run time, rotate d into the range of bearings of the samples where it lies
+        outside (`Controller.bearings`); not in the paper.
     """
 
     fraction: float
@@ -80,6 +82,7 @@ class InverseDynamics(Method):
     fit: Fit
     skip: float = 0.0
     labels: Labels = "performed"
+    clip_bearing: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -252,12 +255,13 @@ def paper_settings(method: InverseDynamics) -> InverseDynamics:
     """Give a method the paper's settings where ours differ.
 
     h = 1 (Def. 1), whole-episode replay (§5.2), λ = 0.25 (A.1.2), φ fitted to mean latents
-    (Eq. 6), and Adam with a constant learning rate (A.1.2).
+    (Eq. 6), Adam with a constant learning rate (A.1.2), and d as it is (Remark 2).
     """
     return dataclasses.replace(
         method,
         name=f"{method.name} paper",
         goal_horizon=1,
+        clip_bearing=False,
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
         fit=dataclasses.replace(
             method.fit,

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from typing import Any
 
 import jax
+from tqdm.auto import tqdm
 
 from genidm import controller, files
 from genidm.config import to_json
+from genidm.controller import Controller
 from genidm.evaluation.evaluate import ControllerFn
 from genidm.experience import Experience
 from genidm.paper.fit import fit
 from genidm.paper.generalize import replay, residual
+from genidm.paper.held_out import FILE, held_out_error
 from genidm.paper.methods import InverseDynamics
-from genidm.paper.pairs import pairs
+from genidm.paper.pairs import Pairs, split_pairs
 from genidm.paper.replaying import RotatedReplay
 from genidm.runs.recording import RecordingRun
 from genidm.store import Stage
@@ -69,7 +73,7 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
             del config[upstream]
         config = {"source": source.directory.name, "repeat": self.repeat} | config
         label = f"{self._label}-fit{self.repeat}" if self.repeat else self._label
-        return self._stage(label, config, __name__, "genidm.paper.fit", "genidm.paper.pairs")
+        return self._stage(label, config, __name__, "genidm.paper.fit", "genidm.paper.held_out")
 
     @property
     def sources(self) -> list[Stage]:
@@ -90,13 +94,13 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
     def _fitted(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
         record = self.experience().part(m.fraction, m.skip).prepared(self.robot)
-        samples = pairs(
+        samples, held_out = split_pairs(
             self.robot, record, self.replay(record),
             goal_horizon=m.goal_horizon, mirror=m.mirror, labels=m.labels,
         )  # fmt: skip
         model = fit(
             self.robot, samples, self._fit_key, m.fit, input_frame=m.input_frame, stage=stage
-        )
+        ).replace(clip_bearing=m.clip_bearing)
         model.save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,
@@ -106,7 +110,18 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
             "learned_from": record.interactions,
             "replayed": self._count(self.replay_stage, "replayed"),
             "settings": to_json(m),
+            "bearings": to_json(model.bearings),
+            "held_out": self._judged(model, samples, held_out),
         }
+
+    def _judged(self, model: Controller, fitted: Pairs, held_out: Pairs) -> dict[str, Any] | None:
+        """Writes and prints the error of a fit on held-out samples; returns its totals."""
+        if not len(held_out.a):
+            return None
+        found = held_out_error(self.robot, model, held_out, fitted)
+        files.save_json(self.controller_stage.path(FILE), found)
+        tqdm.write(f"{self.method.name}: {found}", file=sys.stderr)
+        return found.totals
 
     def _count(self, stage: Stage | None, what: str) -> int:
         return stage.summary()[what] if stage else 0
