@@ -17,6 +17,7 @@ from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.paper.idm import NETWORKS, Architecture
 from genidm.robots import Robot, by_name
+from genidm.symmetry import quarters_to
 
 Frame = Literal["world", "heading"]
 
@@ -76,6 +77,8 @@ class Controller(flax.struct.PyTreeNode):
         models were fitted to lie between these two. (−π, π) if that is not known, or if they lie
         behind the robot too.
       clip_bearing: whether d is rotated to the nearer end of `bearings` where it lies outside.
+      nearest_side: whether the side of the body that is nearest to d counts as its front, as in
+        the samples (`pairs.with_nearest_side`).
     """
 
     params: Any
@@ -86,6 +89,7 @@ class Controller(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
     bearings: Any = flax.struct.field(default_factory=_full_circle)
     clip_bearing: bool = flax.struct.field(pytree_node=False, default=False)
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Compute actions `[..., A]` in [−1, 1] from the current state and goal (Remark 1).
@@ -99,6 +103,13 @@ class Controller(flax.struct.PyTreeNode):
         """
         s = self.robot.check_inputs(s, relative_goal)
         d = direction(relative_goal)
+        if not self.nearest_side:
+            return self._act(s, d)
+        quarters = quarters_to(bearing(d), heading(self.robot, s))
+        action = self._act(self.robot.observation.turn_body_by(s, quarters), d)
+        return self.robot.action.turn_body_by(action, -quarters)
+
+    def _act(self, s: jax.Array, d: jax.Array) -> jax.Array:
         if self.clip_bearing:
             d = self.inside(s, d)
         s, d = in_frame(self.robot, self.input_frame, s, d)
@@ -149,6 +160,7 @@ class Controller(flax.struct.PyTreeNode):
         leaves = jax.tree.map(np.asarray, {name: getattr(self, name) for name in names})
         meta = described(self.robot) | to_json(self.architecture)
         meta |= {"input_frame": self.input_frame, "clip_bearing": self.clip_bearing}
+        meta |= {"nearest_side": self.nearest_side}
         files.save_arrays(path, leaves, meta, overwrite)
 
     @classmethod
@@ -158,13 +170,13 @@ class Controller(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the models is invalid.
         """
-        # Older files have no network, and no bearings.
-        meta = dict[str, Any](network="mlp", clip_bearing=False) | meta
+        # Older files do not have these.
+        meta = dict[str, Any](network="mlp", clip_bearing=False, nearest_side=False) | meta
         for name, allowed in (
             ("action_size", count(robot.action.size, robot.action.size)),
             ("idm", layers), ("lfm", layers), ("latent_size", optional(count(1, WIDEST))),
             ("input_frame", one_of(get_args(Frame))), ("network", one_of(NETWORKS)),
-            ("clip_bearing", one_of((False, True))),
+            ("clip_bearing", one_of((False, True))), ("nearest_side", one_of((False, True))),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         architecture = Architecture(
@@ -177,6 +189,7 @@ class Controller(flax.struct.PyTreeNode):
             input_frame=meta["input_frame"],
             robot=robot,
             clip_bearing=meta["clip_bearing"],
+            nearest_side=meta["nearest_side"],
         )
 
 

@@ -23,6 +23,8 @@ from genidm.robots.base import Robot
 FEW = 0.25
 # Fraction of the samples that a fit does not see, so that its error can be measured on them.
 HELD_OUT = 0.02
+# Samples to turn at once.
+AT_ONCE = 1 << 17
 Labels = Literal["performed", "intended"]
 # d rotates and mirrors by the same rules as the fields of a layout.
 DIRECTION = symmetry.vector("direction", unit="1")
@@ -44,6 +46,10 @@ class Pairs(flax.struct.PyTreeNode):
     d: Any
     a: Any
 
+    def part(self, which: slice) -> Pairs:
+        """Select samples, in all their views."""
+        return Pairs(self.s[:, which], self.d[:, which], self.a[which])
+
 
 def pairs(
     robot: Robot,
@@ -53,6 +59,7 @@ def pairs(
     goal_horizon: int = 100,
     mirror: bool = False,
     labels: Labels = "performed",
+    nearest_side: bool = False,
 ) -> Pairs:
     """Make the samples of a fit: the record, its rotated copies, and their reflections.
 
@@ -65,13 +72,14 @@ def pairs(
         of a replayed segment, the rotated o' of the record is used.
       mirror: add the reflection y → −y of every sample, in every view.
       labels: the actions of the samples: "performed", or "intended", before exploration.
+      nearest_side: see `with_nearest_side`.
 
     Raises:
       BadInput: goal_horizon is not a whole number ≥ 1, or is longer than every episode, or
         the record is invalid, or it has no intended actions.
     """
     record = _usable(robot, experience, turned, goal_horizon, labels)
-    return _samples(robot, record, record.usable, mirror)
+    return _samples(robot, record, record.usable, mirror, nearest_side)
 
 
 def split_pairs(
@@ -82,6 +90,7 @@ def split_pairs(
     goal_horizon: int = 100,
     mirror: bool = False,
     labels: Labels = "performed",
+    nearest_side: bool = False,
 ) -> tuple[Pairs, Pairs]:
     """Make `pairs`, and keep those of a few episodes apart, to measure the error of the fit.
 
@@ -96,6 +105,7 @@ def split_pairs(
       goal_horizon: h, as in `pairs`.
       mirror: add the reflection of every sample.
       labels: the actions of the samples.
+      nearest_side: see `with_nearest_side`.
 
     Returns:
       the samples of the fit, and the held-out samples, with their copies and reflections. If the
@@ -106,8 +116,8 @@ def split_pairs(
     """
     record = _usable(robot, experience, turned, goal_horizon, labels)
     held_out = _held_out(record.begins, record.usable)
-    fitted = _samples(robot, record, record.usable & ~held_out, mirror)
-    return fitted, _samples(robot, record, held_out, mirror)
+    fitted = _samples(robot, record, record.usable & ~held_out, mirror, nearest_side)
+    return fitted, _samples(robot, record, held_out, mirror, nearest_side)
 
 
 class _Usable(NamedTuple):
@@ -217,12 +227,43 @@ def _held_out(begins: np.ndarray, usable: np.ndarray) -> np.ndarray:
     return out
 
 
-def _samples(robot: Robot, record: _Usable, keep: np.ndarray, mirror: bool) -> Pairs:
+def _samples(
+    robot: Robot, record: _Usable, keep: np.ndarray, mirror: bool, nearest_side: bool
+) -> Pairs:
     """Pairs of the steps of a record that `keep [T, B]` selects."""
     moves = np.stack([move[keep] for _, move in record.views])
     d = moves / np.linalg.norm(moves, axis=-1, keepdims=True)
     out = Pairs(np.stack([s[keep] for s, _ in record.views]), d, record.a[keep])
+    if nearest_side:
+        out = with_nearest_side(robot, out)
     return with_reflection(robot, out) if mirror else out
+
+
+def with_nearest_side(robot: Robot, samples: Pairs) -> Pairs:
+    """Turn the body's axes in every sample, so that the side nearest to d is its front.
+
+    This uses the symmetry of a body with four equal sides (the Ant): d is then within ±45° of the
+    heading in all samples. All views of a sample turn by the same quarters.
+
+    Raises:
+      BadInput: the robot has no such body.
+    """
+    if not robot.can_turn_body:
+        raise BadInput(f"nearest_side needs a body with four equal sides, not the {robot.name}")
+    yaw, state, action = robot.observation.yaw, robot.observation, robot.action
+
+    @jax.jit
+    def turn(part: Pairs) -> Pairs:
+        angle = jnp.arctan2(part.d[0, :, 1], part.d[0, :, 0])
+        quarters = symmetry.quarters_to(angle, yaw(part.s[0]))
+        s = state.turn_body_by(part.s, jnp.broadcast_to(quarters, part.s.shape[:2]))
+        return Pairs(s, part.d, action.turn_body_by(part.a, quarters))
+
+    # In parts, because all samples at once would need five times their memory.
+    edges = range(0, len(samples.a), AT_ONCE)
+    parts = [turn(samples.part(slice(i, i + AT_ONCE))) for i in edges]
+    s, a = [np.asarray(p.s) for p in parts], [np.asarray(p.a) for p in parts]
+    return Pairs(np.concatenate(s, axis=1), samples.d, np.concatenate(a))
 
 
 def with_reflection(robot: Robot, samples: Pairs) -> Pairs:

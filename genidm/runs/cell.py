@@ -32,7 +32,7 @@ RUNS: dict[type[Any], Any] = {
 def make_run(robot: Robot, method: AnyMethod, options: Options) -> Run[Any]:
     """Makes the run of a method, with its settings adapted to scale and machine (`resolve`)."""
     chosen = resolve(robot, method, options)
-    return make_exact_run(robot, chosen, options, who_set_what(method, chosen, chosen))
+    return make_exact_run(robot, chosen, options, who_set_what(robot, method, chosen, chosen))
 
 
 def make_exact_run(

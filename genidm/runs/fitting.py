@@ -97,10 +97,11 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
         samples, held_out = split_pairs(
             self.robot, record, self.replay(record),
             goal_horizon=m.goal_horizon, mirror=m.mirror, labels=m.labels,
+            nearest_side=m.nearest_side,
         )  # fmt: skip
         model = fit(
             self.robot, samples, self._fit_key, m.fit, input_frame=m.input_frame, stage=stage
-        ).replace(clip_bearing=m.clip_bearing)
+        ).replace(clip_bearing=m.clip_bearing, nearest_side=m.nearest_side)
         model.save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,

@@ -72,7 +72,9 @@ def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
         if options.paper_settings:
             raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
         return method
-    method = _fitting(paper_settings(method) if options.paper_settings else method, scale)
+    if options.paper_settings:
+        method = paper_settings(method, robot.name)
+    method = _fitting(method, scale)
     if method.generalize:
         method = dataclasses.replace(method, generalize=method.generalize.on(robot))
     return method
@@ -94,26 +96,25 @@ def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
         agent = dataclasses.replace(
             agent, fraction=max(agent.fraction, scale.min_learning_fraction)
         )
-    fraction = max(method.fraction, scale.fraction)
+    # The scale asks for the whole record in place of its first half, not of its last.
+    fraction = method.fraction if method.skip else max(method.fraction, scale.fraction)
     updates = max(1, round(method.fit.updates * scale.updates))
     return dataclasses.replace(
         method,
         agent=agent,
         goal_horizon=min(method.goal_horizon, scale.goal_horizon),
         fraction=fraction,
-        skip=min(method.skip, 1 - fraction),
         fit=dataclasses.replace(method.fit, updates=updates),
     )
 
 
 def who_set_what(
-    method: AnyMethod,
-    chosen: AnyMethod,
-    given: AnyMethod,
+    robot: Robot, method: AnyMethod, chosen: AnyMethod, given: AnyMethod
 ) -> tuple[str, ...]:
     """Says which settings of a run differ from the method's defaults or from the paper, and why.
 
     Args:
+      robot: the robot.
       method: the method with its defaults for the robot.
       chosen: the method adapted to scale, engine and machine (`resolve`).
       given: the method as it runs.
@@ -122,7 +123,7 @@ def who_set_what(
       up to three lines: settings that `resolve` chose, that the user set, and that differ from
       the paper.
     """
-    papers = paper_settings(given) if isinstance(given, InverseDynamics) else given
+    papers = paper_settings(given, robot.name) if isinstance(given, InverseDynamics) else given
     lines = []
     for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),
