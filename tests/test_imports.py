@@ -46,7 +46,7 @@ paper.pairs
 paper.generalize paper.idm
 controller
 paper.fit
-evaluation.scenarios
+evaluation.scenarios evaluation.planners
 evaluation.evaluator
 evaluation.evaluate
 evaluation.invariance evaluation.waypoints
