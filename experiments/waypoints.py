@@ -120,16 +120,8 @@ def main(
     controllers = {name: model for name, (model, _) in models.items()}
     made = walked(robot, controllers, walk, settings, film)
     print("\n".join(aligned(table(made))))
-    numbers = {
-        "waypoints": walk.points(robot),
-        "settings": dataclasses.asdict(settings),
-        "starts": {"robots": walk.robots, "yaw": walk.yaw, "seed": walk.seed},
-        "planners": described(walk.planners(robot)),
-        "engine": str(robot.engine),
-        "methods": jsonable({name: one.summary() for name, one in made.items()}, digits=4),
-        "made": made_now("genidm.evaluation.waypoints", robot, robot.engine),
-        "controllers": {name: str(path) for name, path in zip(models, runs, strict=True)},
-    }
+    numbers = written(robot, made, walk, settings)
+    numbers["controllers"] = {name: str(path) for name, path in zip(models, runs, strict=True)}
     name = f"{robot.name}_waypoints"
     files.save_json(out / f"{name}.json", numbers)
     draw_waypoint_runs(made, settings.goal_radius, out / f"{name}.png")
@@ -157,6 +149,21 @@ def walked(
         )
         for name, controller in controllers.items()
         for plan, planner in planners.items()
+    }
+
+
+def written(
+    robot: Robot, made: Mapping[str, WaypointRuns], walk: Walk, settings: WaypointSettings
+) -> dict[str, Any]:
+    """The numbers as they are written: course, settings, each method's summary, and provenance."""
+    return {
+        "waypoints": walk.points(robot),
+        "settings": dataclasses.asdict(settings),
+        "starts": {"robots": walk.robots, "yaw": walk.yaw, "seed": walk.seed},
+        "planners": described(walk.planners(robot)),
+        "engine": str(robot.engine),
+        "methods": jsonable({name: one.summary() for name, one in made.items()}, digits=4),
+        "made": made_now("genidm.evaluation.waypoints", robot, robot.engine),
     }
 
 
