@@ -273,9 +273,11 @@ def test_the_figure_shows_every_method(made: WaypointRuns, tmp_path: Path) -> No
     np.testing.assert_array_equal(
         ways[-1].get_xdata(), made.position[made.typical, : made.steps[made.typical] + 1, 0]
     )
-    np.testing.assert_array_equal(speed.lines[-1].get_ydata(), made.speed[made.typical])
-    shown = error.lines[-1].get_ydata()
-    np.testing.assert_allclose(shown, np.degrees(made.heading_error[made.typical]))
+    # At 1 m/s and between corners, a mean over a second changes nothing.
+    shown = speed.lines[-1].get_ydata()
+    assert shown[20] == pytest.approx(made.speed[made.typical, 20], abs=1e-3)
+    middle, around = error.lines[-1].get_ydata()[20], made.heading_error[made.typical, 10:31]
+    assert middle == pytest.approx(np.degrees(around.mean()), abs=1e-3)
 
 
 def test_the_figure_marks_falls(tmp_path: Path) -> None:
@@ -285,3 +287,9 @@ def test_the_figure_marks_falls(tmp_path: Path) -> None:
     falls = [line for line in fig.axes[0].lines if line.get_marker() == "x"]
     ends = fallen.position[np.arange(COUNT), fallen.steps, 0]
     assert [line.get_xdata()[0] for line in falls] == ends.tolist()
+
+
+def test_the_figure_draws_robots_that_stand_still(tmp_path: Path) -> None:
+    still = journey(Point(), pace=0.0, settings=WaypointSettings(20, 0.2, chunk=20))
+    fig = draw_waypoint_runs({"LR": still}, SETTINGS.goal_radius, tmp_path / "w.png")
+    assert fig.axes[0].get_title() == "LR: 0% reach all" and np.nanmax(still.speed) == 0

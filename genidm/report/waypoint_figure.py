@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
+from scipy.ndimage import uniform_filter1d
 
 from genidm.evaluation.waypoints import WaypointRuns
 from genidm.report import drawing
@@ -18,7 +19,10 @@ from genidm.report.drawing import Style, Target, styles
 INK = "0.15"
 ARROWS = 26  # along a path
 ARROW = 0.2  # length of an arrow, as a fraction of the mean leg
-OTHERS = 0.22  # opacity of the runs that are not highlighted
+OTHERS = 9.0  # opacity of the runs that are not highlighted, times their number; at most FEW
+FEW = 0.3
+BAND = (10, 90)  # percentiles of the robots, over time
+SMOOTH = 1.0  # seconds over which the values over time are averaged
 MARGIN = 1.08  # of the time axis, beyond the end of the longest highlighted run
 
 
@@ -28,10 +32,11 @@ def draw_waypoint_runs(
     """Trajectories from above, one column per method; below, speed and heading error over time.
 
     The median run of each method (`WaypointRuns.typical`) is highlighted, with arrows that show
-    where the body faces.
+    where the body faces. The bands over time hold the middle 80 % of the robots that still walk.
 
     Args:
-      by_method: method → its runs; all methods have the same waypoints.
+      by_method: method → its runs; all methods have the same waypoints. What follows a comma in a
+        name (a planner) does not change the colour.
       goal_radius: radius of the waypoints' discs, metres.
       path: PNG to write.
     """
@@ -40,11 +45,13 @@ def draw_waypoint_runs(
     grid = fig.subplots(
         3, columns, squeeze=False, sharex="row", sharey="row", height_ratios=(3.2, 1, 1)
     )
-    looks, longest = styles(by_method), 0.0
+    methods = {name: name.split(",")[0] for name in by_method}
+    looks, longest = styles(dict.fromkeys(methods.values())), 0.0
     for (above, speed, error), (name, made) in zip(grid.T, by_method.items(), strict=True):
-        _above(above, made, looks[name], goal_radius)
-        _over_time(speed, made, made.speed, looks[name])
-        _over_time(error, made, np.degrees(made.heading_error), looks[name])
+        look = looks[methods[name]]
+        _above(above, made, look, goal_radius)
+        _over_time(speed, made, made.speed, look)
+        _over_time(error, made, np.degrees(made.heading_error), look)
         above.set_title(_title(name, made), fontsize=11)
         for ax, label in ((above, "x, m"), (speed, ""), (error, "time, s")):
             drawing.style_axes(ax, label, "")
@@ -68,7 +75,7 @@ def _scale(grid: np.ndarray, runs: list[WaypointRuns], goal_radius: float, longe
     corners = np.concatenate([_corners(runs[0]), *(_highlighted(made) for made in runs)])
     low, high = corners.min(0) - 2.2 * goal_radius, corners.max(0) + 2.2 * goal_radius
     above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    fastest = max(float(np.nanpercentile(made.speed, 99)) for made in runs)
+    fastest = max(float(np.nanpercentile(made.speed, 98)) for made in runs)
     speed.set(xlim=(0, MARGIN * longest), ylim=(0, 1.1 * max(fastest, 0.1)))
     error.set(xlim=(0, MARGIN * longest), ylim=(0, 180), yticks=(0, 90, 180))
 
@@ -76,10 +83,11 @@ def _scale(grid: np.ndarray, runs: list[WaypointRuns], goal_radius: float, longe
 def _key(fig: Figure) -> None:
     drawing.key(fig, [
         Line2D([], [], color=INK, linewidth=2, label="median robot"),
-        Line2D([], [], color=INK, linewidth=1, alpha=0.35, label="the other robots"),
+        Line2D([], [], color=INK, linewidth=1, alpha=0.35, label="all robots"),
+        Line2D([], [], color=INK, linewidth=7, alpha=0.2, label="their middle 80 %"),
         Line2D([], [], color=INK, linestyle="", marker=">", label="where its body faces"),
         Line2D([], [], color=INK, linestyle="", marker="x", label="a fall"),
-    ])  # fmt: skip
+    ], "lower")  # fmt: skip
 
 
 def _corners(made: WaypointRuns) -> np.ndarray:
@@ -95,9 +103,10 @@ def _highlighted(made: WaypointRuns) -> np.ndarray:
 def _above(ax: Axes, made: WaypointRuns, style: Style, goal_radius: float) -> None:
     """Draws the course, all trajectories, and the headings along the median one."""
     _course(ax, made, goal_radius)
+    faint = min(FEW, OTHERS / len(made.steps))
     for path, steps, fell in zip(made.position, made.steps, made.fell, strict=True):
         x, y = path[: steps + 1, :2].T
-        ax.plot(x, y, color=style.colour, linewidth=0.8, alpha=OTHERS, zorder=2)
+        ax.plot(x, y, color=style.colour, linewidth=0.9, alpha=faint, zorder=2)
         if fell:
             ax.plot(x[-1], y[-1], "x", color=INK, markersize=4, alpha=0.6, zorder=3)
     walked = _highlighted(made)
@@ -141,10 +150,21 @@ def _arrows(ax: Axes, made: WaypointRuns) -> None:
 
 
 def _over_time(ax: Axes, made: WaypointRuns, values: np.ndarray, style: Style) -> None:
-    """Draws `values [B, T + 1]` of all runs, the median run's arrivals, and its values on top."""
-    seconds = made.dt * np.arange(values.shape[1])
-    for row in values:
-        ax.plot(seconds, row, color=style.colour, linewidth=0.6, alpha=0.6 * OTHERS, zorder=2)
+    """Draws the band of `values [B, T + 1]`, and the median run's values and arrivals."""
+    seconds, smooth = made.dt * np.arange(values.shape[1]), _smooth(values, made.dt)
+    walks = np.isfinite(smooth).any(0)
+    if walks.any():
+        low, high = np.nanpercentile(smooth[:, walks], BAND, axis=0)
+        ax.fill_between(seconds[walks], low, high, color=style.colour, alpha=0.2, linewidth=0)
     for time in made.times[made.typical]:
         ax.axvline(time, color="0.55", linestyle=(0, (4, 3)), linewidth=1, zorder=1)
-    ax.plot(seconds, values[made.typical], color=style.colour, linewidth=1.6, zorder=4)
+    ax.plot(seconds, smooth[made.typical], color=style.colour, linewidth=1.6, zorder=4)
+
+
+def _smooth(values: np.ndarray, dt: float) -> np.ndarray:
+    """Means of `values [B, T + 1]` over SMOOTH seconds, without NaN; NaN stays NaN."""
+    width = 2 * round(SMOOTH / 2 / dt) + 1
+    finite = np.isfinite(values)
+    total = uniform_filter1d(np.where(finite, values, 0.0), width, axis=1, mode="constant")
+    share = uniform_filter1d(finite.astype(float), width, axis=1, mode="constant")
+    return np.where(finite, total / np.maximum(share, 1e-9), np.nan)
