@@ -17,12 +17,13 @@ import tyro
 
 from experiments import table1
 from genidm.experience import Experience
-from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.paper.methods import AnyMethod
 from genidm.robots import Humanoid, HumanoidWorld, Robot
 from genidm.runs.cell import make_run
 from genidm.runs.command import run_cli
+from genidm.runs.fitting import InverseDynamicsRun
 from genidm.runs.resolve import Options
-from genidm.runs.run import InverseDynamicsRun, Run
+from genidm.runs.run import Run
 from genidm.store import Stage
 
 METHODS = ("RL", "GE", "LR")
@@ -53,7 +54,7 @@ class ConvertedRun(InverseDynamicsRun):
     def experience_stage(self) -> Stage:
         assert self.source
         config = {"converted_from": self.source.experience_stage.directory.name}
-        return self._stage(f"experience-converted-{self.seed}", config, __name__)
+        return self._stage(f"experience-converted-{self.seed}", config, __name__, __name__)
 
     @property
     def sources(self) -> list[Stage]:
@@ -70,9 +71,7 @@ class ConvertedRun(InverseDynamicsRun):
         return summary
 
 
-def converted(
-    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
-) -> Run[Any]:
+def converted(robot: Robot, method: AnyMethod, options: Options) -> Run[Any]:
     """The run of a method on HumanoidWorld, on the experience of the same run on the Humanoid."""
     source = make_run(Humanoid(engine=options.engine), method, options)
     run = make_run(robot, method, options)

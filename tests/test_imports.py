@@ -46,6 +46,7 @@ paper.pairs
 paper.generalize paper.idm
 controller
 paper.fit
+paper.held_out
 evaluation.scenarios evaluation.planners
 evaluation.evaluator
 evaluation.evaluate
@@ -53,11 +54,13 @@ evaluation.invariance evaluation.waypoints
 evaluation.stats evaluation.sanity
 report.rows
 report.table report.drawing
-report.figures report.waypoint_figure
+report.figures report.waypoint_figure report.held_out_figure
 report
 paper.methods
 runs.scale
 runs.resolve runs.run
+runs.recording
+runs.fitting runs.policies
 report.runs
 report.shown
 report.write

@@ -17,12 +17,13 @@ from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.rollout_then_learn import LearningAgent
 from genidm.agents.sac import SAC
-from genidm.checks import check, check_value, count, label, positive
+from genidm.checks import check, check_value, count, label, number, positive
 from genidm.controller import Frame
 from genidm.errors import BadInput
 from genidm.paper import protocol
 from genidm.paper.fit import Fit
 from genidm.paper.generalize import Generalize
+from genidm.paper.pairs import Labels
 from genidm.tasks import Dense, GoToGoal, Sparse, WalkForward
 
 
@@ -57,14 +58,20 @@ class InverseDynamics(Method):
     """Inverse dynamics (§4): a controller fitted to experience without goals.
 
     Attributes:
-      fraction: fraction of the record, from its start, to learn from. For the paper's GE and
-        LR, 𝒢 makes the other half (A.1.2).
+      fraction: fraction of the record to learn from. For the paper's GE and LR, 𝒢 makes the
+        other half (A.1.2).
+      skip: fraction of the record to leave out before that part; 0 takes the first part, as the
+        paper does, and 1 − fraction the last.
+      labels: the recorded actions to learn: "performed" (the paper's), or "intended", the agent's
+        choice before exploration.
       generalize: settings of 𝒢; None learns from the record only.
       goal_horizon: h, steps to the intermediate goal o' (Def. 1); 1 is the paper's "next
         position". Steps whose episode ends earlier are left out.
       mirror: add the reflection of every sample; not in the paper.
       input_frame: "heading" rotates every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
+      clip_bearing: at run time, rotate d into the range of bearings of the samples where it lies
+        outside (`Controller.bearings`); not in the paper.
     """
 
     fraction: float
@@ -73,13 +80,29 @@ class InverseDynamics(Method):
     mirror: bool
     input_frame: Frame
     fit: Fit
+    skip: float = 0.0
+    labels: Labels = "performed"
+    clip_bearing: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, fraction=positive(1), goal_horizon=count())
+        check(self, fraction=positive(1), skip=number(0, 1), goal_horizon=count())
+        if self.fraction + self.skip > 1 + 1e-9:
+            raise BadInput(
+                f"skip {self.skip:g} and fraction {self.fraction:g} are more than the record"
+            )
 
 
-Methods = tuple[GoalConditioned | InverseDynamics, ...]
+@dataclasses.dataclass(frozen=True)
+class AgentTurned(Method):
+    """The agent itself, with the world turned so that +x points at the goal: no fit at all.
+
+    It is not in the paper. A fit to the agent's experience should steer better than this.
+    """
+
+
+AnyMethod = GoalConditioned | InverseDynamics | AgentTurned
+Methods = tuple[AnyMethod, ...]
 Column = tuple[
     InverseDynamics,
     InverseDynamics,
@@ -216,7 +239,7 @@ TABLES = {
 """Robot → the methods of its column; other robots use the Ant's."""
 
 
-def by_name(name: str, robot: str = "ant") -> GoalConditioned | InverseDynamics:
+def by_name(name: str, robot: str = "ant") -> AnyMethod:
     """Find a method by its name, with its settings for a robot.
 
     Raises:
@@ -232,12 +255,13 @@ def paper_settings(method: InverseDynamics) -> InverseDynamics:
     """Give a method the paper's settings where ours differ.
 
     h = 1 (Def. 1), whole-episode replay (§5.2), λ = 0.25 (A.1.2), φ fitted to mean latents
-    (Eq. 6), and Adam with a constant learning rate (A.1.2).
+    (Eq. 6), Adam with a constant learning rate (A.1.2), and d as it is (Remark 2).
     """
     return dataclasses.replace(
         method,
         name=f"{method.name} paper",
         goal_horizon=1,
+        clip_bearing=False,
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
         fit=dataclasses.replace(
             method.fit,

@@ -13,7 +13,7 @@ from genidm.checks import check, count, optional
 from genidm.config import flat, to_json
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import EvaluationSettings
-from genidm.paper.methods import GoalConditioned, InverseDynamics, paper_settings
+from genidm.paper.methods import AnyMethod, InverseDynamics, paper_settings
 from genidm.robots import Robot
 from genidm.runs.scale import Scale, scale_of
 
@@ -55,9 +55,7 @@ class Options:
         check(self, seed=checks.seed(), episodes=optional(count()))
 
 
-def resolve(
-    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
-) -> GoalConditioned | InverseDynamics:
+def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
     """Adapts a method's settings to the scale, the machine and the robot's engine.
 
     On the command line the result gives the defaults of the method's flags, so a value that the
@@ -70,7 +68,7 @@ def resolve(
     agent = _at_scale(method.agent, scale)
     agent = agent if devices.memory() is None else agent.for_accelerator()
     method = dataclasses.replace(method, agent=agent)
-    if isinstance(method, GoalConditioned):
+    if not isinstance(method, InverseDynamics):
         if options.paper_settings:
             raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
         return method
@@ -96,20 +94,22 @@ def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
         agent = dataclasses.replace(
             agent, fraction=max(agent.fraction, scale.min_learning_fraction)
         )
+    fraction = max(method.fraction, scale.fraction)
     updates = max(1, round(method.fit.updates * scale.updates))
     return dataclasses.replace(
         method,
         agent=agent,
         goal_horizon=min(method.goal_horizon, scale.goal_horizon),
-        fraction=max(method.fraction, scale.fraction),
+        fraction=fraction,
+        skip=min(method.skip, 1 - fraction),
         fit=dataclasses.replace(method.fit, updates=updates),
     )
 
 
 def who_set_what(
-    method: GoalConditioned | InverseDynamics,
-    chosen: GoalConditioned | InverseDynamics,
-    given: GoalConditioned | InverseDynamics,
+    method: AnyMethod,
+    chosen: AnyMethod,
+    given: AnyMethod,
 ) -> tuple[str, ...]:
     """Says which settings of a run differ from the method's defaults or from the paper, and why.
 
