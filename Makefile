@@ -44,7 +44,7 @@ results: $(STAMP)  ## make everything in experiments/results again, with runs in
 	  $(BIN)/python -m experiments.table1 --robot $$robot --seeds 3 --run-dir $(RESULTS) \
 	    --report-dir experiments/results; \
 	  $(BIN)/python -m experiments.waypoints $(RESULTS)/$$robot/LR-0-?????????? $(RESULTS)/$$robot/GE-0-?????????? \
-	    $(RESULTS)/$$robot/VGCP-0-?????????? $(RESULTS)/$$robot/HF-0-?????????? --goal-radius 1 --out experiments/results; \
+	    $(RESULTS)/$$robot/VGCP-0-?????????? $(RESULTS)/$$robot/HF-0-?????????? --out experiments/results; \
 	  $(BIN)/python -m experiments.benchmark --robot $$robot; \
 	done; \
 	$(BIN)/python -m experiments.humanoid_world --run-dir $(RESULTS) --report-dir experiments/results; \

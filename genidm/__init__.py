@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from genidm.evaluation.episodes import Episodes as Episodes
     from genidm.evaluation.evaluate import EvaluationSettings as EvaluationSettings
     from genidm.evaluation.evaluate import evaluate as evaluate
+    from genidm.evaluation.planners import ArcPlanner as ArcPlanner
     from genidm.evaluation.scenarios import Scenarios as Scenarios
     from genidm.evaluation.scenarios import scenarios as scenarios
     from genidm.evaluation.waypoints import WaypointSettings as WaypointSettings
@@ -79,6 +80,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "evaluation.evaluate": ("evaluate", "EvaluationSettings"),
     "evaluation.episodes": ("Episodes",),
     "evaluation.waypoints": ("follow_waypoints", "WaypointSettings"),
+    "evaluation.planners": ("ArcPlanner",),
     "paper.methods": ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR", "HF"),
     "symmetry": ("Layout",),
     "errors": ("BadInput",),

@@ -18,6 +18,7 @@ from genidm.agents.sac import SAC
 from genidm.checks import count, layers, number, optional, positive
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import EvaluationSettings
+from genidm.evaluation.planners import ArcPlanner
 from genidm.evaluation.waypoints import WaypointSettings
 from genidm.paper.fit import Fit
 from genidm.paper.generalize import Generalize
@@ -36,6 +37,7 @@ SETTINGS = [
     EvaluationSettings(),
     Generalize(),
     WaypointSettings(),
+    ArcPlanner(),
     WalkForward(),
     GoToGoal(),
     Dense(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import runpy
 import subprocess
 import sys
@@ -179,19 +180,50 @@ def test_runs_are_tested_again_side_by_side(direct: Finished, capsys, monkeypatc
 
 def test_it_is_led_through_waypoints(direct: Finished, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(ROBOTS, "point", Point)
-    runs = (stage_of(direct.out, "VGCP"),) * 2
-    waypoints.main(runs, robots=2, out=tmp_path, settings=WaypointSettings(max_steps=20, chunk=10))
+    runs, walk = (stage_of(direct.out, "VGCP"),) * 2, waypoints.Walk(robots=2)
+    settings = WaypointSettings(max_steps=20, chunk=10)
+    waypoints.main(runs, walk, out=tmp_path, settings=settings)
     written = json.loads((tmp_path / "point_waypoints.json").read_text())
     assert list(written["methods"]) == ["VGCP", f"VGCP, {runs[0].name}"]
     one, again = written["methods"].values()
-    assert one == again and one["runs"] == 2 and len(one["reached"]) == 5
+    assert one == again and one["runs"] == 2 and len(one["reached"]) == 5 and one["all"] == 0
     assert (tmp_path / "point_waypoints.png").stat().st_size > 10_000
-    assert capsys.readouterr().out.splitlines()[0].startswith("VGCP: 0 of 2 reached all waypoints")
-    for wrong, robots, why in (((), 1, "of a run"), (runs, 0, "robots must")):
-        with pytest.raises(BadInput, match=why):
-            waypoints.main(wrong, robots=robots, out=tmp_path)
+    header, row, _ = capsys.readouterr().out.splitlines()[:3]
+    assert header.split()[:9] == ["reached", "1", "2", "3", "4", "5", "all", "falls", "off"]
+    assert row.split()[:8] == ["VGCP", *["0%"] * 7] and f"{one['speed']:.2f} m/s" in row
+    with pytest.raises(BadInput, match="of a run"):
+        waypoints.main((), walk, out=tmp_path)
     with pytest.raises(BadInput, match="an even number, not 3"):
-        waypoints.main(runs, (3.0, 0.0, 5.0), out=tmp_path)
+        waypoints.main(runs, waypoints.Walk((3.0, 0.0, 5.0)), out=tmp_path)
+    for wrong in ({"robots": 0}, {"planner": ()}, {"turning_radius": 0.0}, {"yaw": math.nan}):
+        with pytest.raises(BadInput, match=next(iter(wrong))):
+            waypoints.Walk(**wrong)
+
+
+def test_planners_walk_the_same_course_from_the_same_starts(
+    direct: Finished, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setitem(ROBOTS, "point", Point)
+    walk = waypoints.Walk((1.0, 0.0, 1.0, 1.0), 2, 0.3, planner=("straight", "arc"), look_ahead=0.2)
+    settings = WaypointSettings(max_steps=20, chunk=10)
+    waypoints.main((stage_of(direct.out, "VGCP"),), walk, out=tmp_path, settings=settings)
+    written = json.loads((tmp_path / "point_waypoints.json").read_text())
+    assert list(written["methods"]) == ["VGCP, straight", "VGCP, arc"]
+    assert written["waypoints"] == [[1, 0], [1, 1]]
+    assert written["starts"] == {"robots": 2, "yaw": 0.3, "seed": 0}
+    # A third of a leg, which is 0.6 times the point's greatest target distance.
+    assert written["planners"] == {
+        "straight": {},
+        "arc": {"turning_radius": 1.0, "look_ahead": 0.2},
+    }
+    assert written["settings"]["max_steps"] == 20 and written["made"]["code"]
+
+
+def test_the_course_bends_both_ways_and_fits_the_robot() -> None:
+    legs = np.diff(waypoints.course(Point()), axis=0, prepend=np.zeros((1, 2)))
+    np.testing.assert_allclose(np.linalg.norm(legs, axis=-1), 3.0, atol=2e-3)
+    angles = np.degrees(np.diff(np.arctan2(legs[:, 1], legs[:, 0])))
+    np.testing.assert_allclose(angles, [60, 60, -60, -60], atol=0.1)
 
 
 def test_how_fast_a_policy_walks_is_told(finished: Finished, capsys, monkeypatch) -> None:

@@ -47,7 +47,7 @@ paper.generalize paper.idm
 controller
 paper.fit
 paper.held_out
-evaluation.scenarios
+evaluation.scenarios evaluation.planners
 evaluation.evaluator
 evaluation.evaluate
 evaluation.invariance evaluation.waypoints

@@ -24,7 +24,7 @@ from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import scenarios
-from genidm.evaluation.waypoints import WaypointSettings
+from genidm.evaluation.waypoints import WaypointSettings, follow_waypoints
 from genidm.files import Corrupt, load_arrays, save_arrays, save_json
 from genidm.paper import methods
 from genidm.robots import Ant, HumanoidWorld, Logged, remade
@@ -107,6 +107,20 @@ def test_waypoints_are_each_to_go_until_they_are_reached() -> None:
     at = np.array([0.0, first - 0.01, first, last])
     assert take.left(at).tolist() == [[True, True], [True, True], [False, True], [False, False]]
     np.testing.assert_allclose(take.goal(at)[:, :2], [points[0]] * 2 + [points[1]] * 2)
+
+
+def test_a_walk_is_shown_as_it_was() -> None:
+    robot, keys = Drawn(), jax.random.split(jax.random.key(0), 3)
+    walked = follow_waypoints(
+        robot, straight(robot), [(1.0, 0.0), (1.0, 1.0)], keys, jnp.zeros(3),
+        settings=WaypointSettings(200), record=video.POSES, quiet=True,
+    )  # fmt: skip
+    film = video.render_walked(robot, walked, [2, 0], 0.25, "a walk")
+    assert film.title == "a walk" and film.goal_radius == 0.25
+    for take, i in zip(film.clips, (2, 0), strict=True):
+        np.testing.assert_array_equal(take.position, walked.position[i, : walked.steps[i] + 1])
+        np.testing.assert_array_equal(take.qpos[:, :3], take.position)
+        assert take.arrival.tolist() == walked.arrival[i].tolist() and not take.fell
 
 
 def test_seconds_end_a_film(made: Video) -> None:

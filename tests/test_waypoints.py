@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 
@@ -82,11 +83,38 @@ def test_cross_track_error_is_the_distance_from_the_leg(made: WaypointRuns) -> N
 
 
 def test_heading_error_is_between_heading_and_course(made: WaypointRuns) -> None:
-    i, t = 2, 30
-    step = made.position[i, t + 1] - made.position[i, t]
+    i, t, side = 2, 30, 5  # a quarter of a second of 0.05 s steps
+    step = made.position[i, t + side] - made.position[i, t - side]
     expected = abs(math.remainder(made.heading[i, t] - math.atan2(step[1], step[0]), 2 * math.pi))
     assert made.heading_error[i, t] == pytest.approx(expected, abs=1e-5)
-    assert np.isnan(made.heading_error[i, made.steps[i] :]).all()
+    assert np.isnan(made.heading_error[i, made.steps[i] + 1 :]).all()
+
+
+def test_speed_is_that_of_the_point(made: WaypointRuns) -> None:
+    """1 m/s, but for the half second around a corner, where the way is longer than the line."""
+    for i in range(COUNT):
+        speed, steps = made.speed[i], made.steps[i]
+        corner = np.abs(np.arange(steps + 1)[:, None] - made.arrival[i, :2]).min(1) <= 5
+        np.testing.assert_allclose(speed[: steps + 1][~corner], 1.0, atol=1e-3)
+        assert (speed[: steps + 1][corner] <= 1.001).all() and np.isnan(speed[steps + 1 :]).all()
+    np.testing.assert_allclose(made.leg_speed, 1.0, atol=0.06)
+    slow = journey(Point(), pace=0.5).summary()
+    assert slow["speed"] == pytest.approx(0.5, abs=0.02) and slow["all"] == 1.0
+    assert journey(Point(), pace=0.0).heading_error.size
+    assert journey(Point(), pace=0.0).summary()["heading_error"] is None
+
+
+def test_the_typical_run_is_the_median_one() -> None:
+    still = np.zeros((5, 11, 3))
+    arrival = np.asarray([[5, -1], [3, 7], [4, 9], [-1, -1], [3, 8]])
+    steps = np.asarray([10, 7, 9, 10, 8])
+    runs = WaypointRuns(
+        np.zeros((5, 2, 3)), still, still[..., 0], steps, arrival, np.zeros(5, bool), 0.1
+    )
+    assert runs.typical == 2  # better: 1 and 4, which are faster; worse: 0 and 3
+    found = runs.summary()
+    assert found["all"] == 0.6 and found["reached"] == [0.8, 0.6] and found["speed"] == 0.0
+    assert found["seconds"] == pytest.approx([0.375, 0.8])
 
 
 def test_the_number_of_devices_changes_nothing(made: WaypointRuns) -> None:
@@ -118,6 +146,17 @@ def test_any_planner_will_do() -> None:
 
     there = journey(Point(), planner=outside)
     assert (there.arrival > 0).all() and there.position[..., 0].max() > 2.0
+
+
+def test_a_planner_sees_the_heading_if_it_has_an_argument_for_it() -> None:
+    def abreast(o: jax.Array, waypoints: jax.Array, left: jax.Array, heading: jax.Array):
+        return o + jnp.stack([-jnp.sin(heading), jnp.cos(heading), 0 * heading], axis=-1)
+
+    for planner in (abreast, jax.jit(abreast), functools.partial(abreast)):
+        there = journey(Point(), planner=planner, settings=WaypointSettings(4, 0.2, chunk=4))
+        step = there.position[:, 1] - there.position[:, 0]
+        side = np.arctan2(step[:, 1], step[:, 0]) - there.heading[:, 0]
+        np.testing.assert_allclose(np.cos(side - np.pi / 2), 1.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -226,8 +265,31 @@ def test_what_is_recorded_is_kept_of_every_state(made: WaypointRuns) -> None:
 def test_the_figure_shows_every_method(made: WaypointRuns, tmp_path: Path) -> None:
     fig = draw_waypoint_runs({"LR": made, "VGCP": made}, SETTINGS.goal_radius, tmp_path / "w.png")
     assert (tmp_path / "w.png").stat().st_size > 10_000
-    above = fig.axes[0]
-    assert above.get_title() == "LR"
-    assert {text.get_text() for text in above.texts} == {"1", "2", "3"}
+    above, speed, error = fig.axes[0], fig.axes[2], fig.axes[4]
+    assert above.get_title() == "LR: 100% reach all"
+    assert {text.get_text() for text in above.texts} == {"1", "2", "3", "100%"}
     ways = [line for line in above.lines if line.get_linestyle() == "-"]
-    assert len(ways) == COUNT
+    assert len(ways) == COUNT + 1  # the median one once more, on top
+    np.testing.assert_array_equal(
+        ways[-1].get_xdata(), made.position[made.typical, : made.steps[made.typical] + 1, 0]
+    )
+    # At 1 m/s and between corners, a mean over a second changes nothing.
+    shown = speed.lines[-1].get_ydata()
+    assert shown[20] == pytest.approx(made.speed[made.typical, 20], abs=1e-3)
+    middle, around = error.lines[-1].get_ydata()[20], made.heading_error[made.typical, 10:31]
+    assert middle == pytest.approx(np.degrees(around.mean()), abs=1e-3)
+
+
+def test_the_figure_marks_falls(tmp_path: Path) -> None:
+    fallen = journey(Point(falls_at=2.1))
+    fig = draw_waypoint_runs({"LR": fallen}, SETTINGS.goal_radius, tmp_path / "w.png")
+    assert fig.axes[0].get_title() == "LR: 0% reach all, 100% fell"
+    falls = [line for line in fig.axes[0].lines if line.get_marker() == "x"]
+    ends = fallen.position[np.arange(COUNT), fallen.steps, 0]
+    assert [line.get_xdata()[0] for line in falls] == ends.tolist()
+
+
+def test_the_figure_draws_robots_that_stand_still(tmp_path: Path) -> None:
+    still = journey(Point(), pace=0.0, settings=WaypointSettings(20, 0.2, chunk=20))
+    fig = draw_waypoint_runs({"LR": still}, SETTINGS.goal_radius, tmp_path / "w.png")
+    assert fig.axes[0].get_title() == "LR: 0% reach all" and np.nanmax(still.speed) == 0

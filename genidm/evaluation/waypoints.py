@@ -17,21 +17,16 @@ from genidm import devices
 from genidm.checks import check, count, positive
 from genidm.errors import BadInput
 from genidm.evaluation.evaluator import MOST_AT_ONCE, ControllerFn, as_tree, ask, steered
+from genidm.evaluation.planners import Planner, first_unreached, with_heading
 from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot, State, select
 from genidm.rollout import Move, rollout
 from genidm.symmetry import horizontal_norm, wrap
 
-# (o [B, 3], waypoints [B, W, 3], unreached [B, W] bool) → target [B, 3], metres, world frame;
-# called at each step.
-Planner = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
-
-
-def first_unreached(o: jax.Array, waypoints: jax.Array, unreached: jax.Array) -> jax.Array:
-    """Plan straight to the first unreached waypoint; to the last if all are reached."""
-    first = jnp.where(unreached.any(-1), jnp.argmax(unreached, axis=-1), waypoints.shape[1] - 1)
-    return jnp.take_along_axis(waypoints, first[:, None, None], axis=1)[:, 0]
-
+# Seconds over which walking speed and direction are measured: about one stride.
+SPAN = 0.5
+# m/s; a slower robot has no walking direction.
+STILL = 0.02
 
 # State [B] → a tree of arrays [B, ...], which is kept of every state.
 Record = Callable[[State], Any]
@@ -110,28 +105,64 @@ class WaypointRuns:
         return np.where(self.made, distance, np.nan)
 
     @property
+    def speed(self) -> np.ndarray:
+        """Walking speed `[B, T + 1]`, m/s, without the sway of the gait; NaN after the end.
+
+        It is the distance between the positions a quarter of a second before and after, by time.
+        """
+        return np.where(self.made, np.linalg.norm(self._velocity, axis=-1), np.nan)
+
+    @property
     def heading_error(self) -> np.ndarray:
-        """Angle `[B, T]` between heading and motion, radians; NaN without motion."""
-        motion = np.diff(self.position[..., :2], axis=1)
-        course = np.arctan2(motion[..., 1], motion[..., 0])
-        angle = np.abs(wrap(jnp.asarray(self.heading[:, :-1] - course)))
-        moves = self.made[:, 1:] & (np.linalg.norm(motion, axis=-1) > 1e-3)
-        return np.where(moves, angle, np.nan)
+        """Angle `[B, T + 1]` between heading and walking direction, radians; NaN without motion.
+
+        The walking direction is that of the displacement of which `speed` is the length.
+        """
+        course = np.arctan2(self._velocity[..., 1], self._velocity[..., 0])
+        angle = np.abs(wrap(jnp.asarray(self.heading - course)))
+        return np.where(self.speed > STILL, angle, np.nan)
+
+    @property
+    def leg_speed(self) -> np.ndarray:
+        """Mean speed on each leg `[W]`, m/s, over the steps of all runs; NaN if there are none."""
+        speed, leg = self.speed, self._leg(0)[..., 0]
+        found = (speed[self.made & (leg == i)] for i in range(self.waypoints.shape[1]))
+        return np.asarray([x.mean() if len(x) else np.nan for x in found])
+
+    @property
+    def typical(self) -> int:
+        """Index of the median run: by the waypoints that it reached, then by its duration."""
+        order = np.lexsort((self.steps, -(self.arrival >= 0).sum(1)))
+        return int(order[len(order) // 2])
 
     def summary(self) -> dict[str, Any]:
-        """Means over the runs: metres, seconds, radians, fractions of the runs."""
-        reached, heading_error = self.arrival >= 0, self.heading_error
-        times = [t[np.isfinite(t)] for t in self.times.T]
+        """Means over the runs: metres, seconds, m/s, radians, fractions of the runs.
+
+        `reached`, `seconds` (from the start) and `leg_speed` have a value for each waypoint;
+        `all` is the fraction of the runs that reached every waypoint. A mean of nothing is None.
+        """
+        reached, times = self.arrival >= 0, self.times.T
         return {
             "runs": len(self.steps),
-            "cross_track_error": float(np.nanmean(self.cross_track_error)),
-            "heading_error": float(np.nanmean(heading_error))
-            if np.isfinite(heading_error).any()
-            else None,
+            "cross_track_error": _mean(self.cross_track_error),
+            "heading_error": _mean(self.heading_error),
+            "speed": _mean(self.speed),
+            "leg_speed": [_mean(x) for x in self.leg_speed],
             "reached": reached.mean(0).tolist(),
-            "seconds": [float(t.mean()) if len(t) else None for t in times],
+            "all": float(reached.all(1).mean()),
+            "seconds": [_mean(t) for t in times],
             "fell": float(self.fell.mean()),
         }
+
+    @functools.cached_property
+    def _velocity(self) -> np.ndarray:
+        """Displacement `[B, T + 1, 2]` from 0.25 s before to 0.25 s after, by time, m/s."""
+        side, step = max(1, round(SPAN / 2 / self.dt)), np.arange(self.position.shape[1])
+        after = np.minimum(step + side, self.steps[:, None])
+        before = np.minimum(np.maximum(step - side, 0), after)
+        run, seconds = np.arange(len(after))[:, None], self.dt * np.maximum(after - before, 1)
+        moved = self.position[run, after, :2] - self.position[run, before, :2]
+        return moved / seconds[..., None]
 
     def _corners(self) -> np.ndarray:
         """The start and the waypoints `[B, W + 1, 2]`."""
@@ -142,6 +173,12 @@ class WaypointRuns:
         step = np.arange(self.position.shape[1])
         arrived = (self.arrival[:, None] >= 0) & (self.arrival[:, None] < step[:, None])
         return np.minimum(arrived.sum(-1), self.waypoints.shape[1] - 1)[..., None] + end
+
+
+def _mean(x: np.ndarray) -> float | None:
+    """The mean of the finite numbers; None if there are none."""
+    finite = np.asarray(x)[np.isfinite(x)]
+    return float(finite.mean()) if len(finite) else None
 
 
 class Walker(flax.struct.PyTreeNode):
@@ -184,7 +221,9 @@ def follow_waypoints(
         `[B, W, 3]`; the default height is that of a standing robot.
       keys: random keys `[B]` of the starts.
       yaw: `[B]`, rotations of the starts, radians.
-      planner: gives the next target; the default is the next waypoint.
+      planner: (o `[B, 3]`, waypoints `[B, W, 3]`, unreached `[B, W]`) → the target `[B, 3]` to walk
+        to now, in the world's frame, at each step; the default is the next waypoint. A planner
+        with an argument `heading` also gets the headings `[B]`, radians.
       settings: length of a run, goal radius.
       record: what to keep of every state with position and heading; by default nothing.
       mesh: devices that share the robots; None takes those of the robot's engine.
@@ -305,7 +344,8 @@ def _chunk(
     def act(walker: Walker, _: None) -> tuple[State, jax.Array, None]:
         robots = walker.robots
         o = robots.position
-        target = ask("the planner", planner, o.shape, o, points, walker.arrival < 0)
+        plan = with_heading(planner, robots.heading)
+        target = ask("the planner", plan, o.shape, o, points, walker.arrival < 0)
         target = target.astype(o.dtype)
         return robots, steered(robot, controller, robots, target), None
 

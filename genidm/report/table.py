@@ -24,13 +24,13 @@ BRIEF = 4  # columns of the comparisons if there is only one training seed
 
 def text(results: Mapping[str, Any]) -> str:
     """The table as aligned text for a terminal, then its notes and the paired comparisons."""
-    body = _aligned(_cells(results))
+    body = aligned(_cells(results))
     rule = "─" * max(map(len, body))
     notes = itertools.chain(*(textwrap.wrap(note, 110) for note in _notes(results)))
     lines = [_caption(results), "", body[0], rule, *body[1:], rule, *notes]
     compared = _comparisons(results)
     legend = textwrap.wrap(_legend(compared), 110)
-    return "\n".join([*lines, "", *legend, "", *_aligned(compared)] if compared else lines)
+    return "\n".join([*lines, "", *legend, "", *aligned(compared)] if compared else lines)
 
 
 def markdown(results: Mapping[str, Any]) -> str:
@@ -65,7 +65,7 @@ def _row(name: str, m: Mapping[str, Any], paper: tuple[float, float] | None) -> 
     )
 
 
-def _aligned(cells: Sequence[tuple[str, ...]]) -> list[str]:
+def aligned(cells: Sequence[tuple[str, ...]]) -> list[str]:
     """Lines with aligned columns: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = []

@@ -16,6 +16,7 @@ from genidm.errors import BadInput
 from genidm.files import check_writable, save_bytes, save_text
 from genidm.video.backends import backend
 from genidm.video.clips import (
+    POSES,
     Clip,
     Video,
     recorded,
@@ -23,6 +24,7 @@ from genidm.video.clips import (
     render_recorded,
     render_run,
     render_test,
+    render_walked,
 )
 from genidm.video.encoding import FASTEST, encoder, gif, mp4
 from genidm.video.pages import Page, page
@@ -83,6 +85,7 @@ def write(made: Video, path: Path | str, quiet: bool = False, **changes: Any) ->
 
 
 __all__ = [
+    "POSES",
     "Clip",
     "Page",
     "RenderSettings",
@@ -95,5 +98,6 @@ __all__ = [
     "render_recorded",
     "render_run",
     "render_test",
+    "render_walked",
     "write",
 ]

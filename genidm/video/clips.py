@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ EPISODES = (0, 1, 2)
 MOST_EPISODES = 10**6  # of a test seed
 # Seconds; a robot that has not arrived by then mostly walks in circles.
 LONGEST = 20.0
+# What `follow_waypoints` must record of each state for `render_walked`.
+POSES = operator.attrgetter("physics")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,15 +143,34 @@ def render(
     Raises:
       BadInput: the robot has no visual model, or the waypoints are invalid.
     """
-    settings, visual_model = settings or WaypointSettings(), robot.visual_model()
-    fill = np.arange(-(-len(keys) // LANES) * LANES) % len(keys)
-    points = np.asarray(waypoints)
+    robot.visual_model()  # raises its error before anything is computed
+    settings, fill = settings or WaypointSettings(), np.arange(-(-len(keys) // LANES) * LANES)
+    fill, points = fill % len(keys), np.asarray(waypoints)
     made = follow_waypoints(
         robot, controller, points[fill] if points.ndim == 3 else points, keys[fill], yaw[fill],
-        settings=settings, record=operator.attrgetter("physics"), quiet=quiet,
+        settings=settings, record=POSES, quiet=quiet,
     )  # fmt: skip
-    clips = list(_clips(made, robot.visual_qpos(made.recorded)))[: len(keys)]
-    return Video(title or robot.name, visual_model, clips, settings.goal_radius)
+    return render_walked(robot, made, range(len(keys)), settings.goal_radius, title)
+
+
+def render_walked(
+    robot: Robot, made: WaypointRuns, runs: Sequence[int], goal_radius: float, title: str = ""
+) -> Video:
+    """Shows runs through waypoints, exactly as they were.
+
+    Args:
+      robot: the robot of the runs.
+      made: the runs of `follow_waypoints(…, record=POSES)`.
+      runs: indices of the runs to show.
+      goal_radius: metres; a waypoint was reached when the robot was this near.
+      title: text in the caption; default: the robot's name.
+
+    Raises:
+      BadInput: the robot has no visual model.
+    """
+    qpos = {i: robot.visual_qpos(jax.tree.map(operator.itemgetter(i), made.recorded)) for i in runs}
+    clips = [_clip(made, i, poses) for i, poses in qpos.items()]
+    return Video(title or robot.name, robot.visual_model(), clips, goal_radius)
 
 
 def render_test(
@@ -361,13 +382,13 @@ def _summary_value(directory: Path | str, name: str) -> Any:
     return summary[name]
 
 
-def _clips(made: WaypointRuns, qpos: np.ndarray) -> Iterator[Clip]:
-    for i, states in enumerate(made.steps + 1):
-        yield Clip(
-            qpos=qpos[i, :states],
-            position=made.position[i, :states],
-            waypoints=made.waypoints[i],
-            arrival=made.arrival[i],
-            fell=bool(made.fell[i]),
-            dt=made.dt,
-        )
+def _clip(made: WaypointRuns, run: int, qpos: np.ndarray) -> Clip:
+    states = made.steps[run] + 1
+    return Clip(
+        qpos=qpos[:states],
+        position=made.position[run, :states],
+        waypoints=made.waypoints[run],
+        arrival=made.arrival[run],
+        fell=bool(made.fell[run]),
+        dt=made.dt,
+    )
