@@ -41,7 +41,11 @@ pytestmark = pytest.mark.usefixtures("one_bank")
 
 def test_the_method_with_paper_settings_is_the_papers() -> None:
     this = make_run(Point(), LR, Options(paper_settings=True)).method
-    assert this == paper_settings(LR, Point.name) and this.name == "LR paper" and this.goal_horizon == 1
+    assert (
+        this == paper_settings(LR, Point.name)
+        and this.name == "LR paper"
+        and this.goal_horizon == 1
+    )
     kept = (
         this.generalize.mode,
         this.fit.latent_loss_weight,
@@ -66,7 +70,9 @@ def test_scales_are_shares_of_the_paper() -> None:
     assert quick.interactions < 500_000 and quick.updates < 0.5 and quick.goal_horizon < 100
     this = make_run(Point(), dataclasses.replace(LR, goal_horizon=999), Options(scale="quick"))
     assert this.method.goal_horizon == quick.goal_horizon
-    assert this.method.fraction == quick.fraction == 1.0
+    assert (this.method.skip, this.method.fraction) == (0.5, 0.5)  # the last half, at any scale
+    first = make_run(Point(), LR, Options(scale="quick", paper_settings=True))
+    assert first.method.fraction == quick.fraction == 1.0
     given = {
         name: make_run(Point(), methods.LR, Options(scale=name)) for name in ("quick", "paper")
     }
@@ -98,7 +104,7 @@ def test_a_scale_is_a_number_however_it_is_written(text: str) -> None:
                 "0.1",
             ),
             "fit.updates",
-            2000,
+            1000,
         ),
         (("--paper-settings", "--method.goal-horizon", "7"), "goal_horizon", 7),
         (
@@ -133,7 +139,7 @@ def test_who_has_set_what_is_known(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["lr", "--scale", "0.1", "--method.fit.batch-size", "64"])
     command_module.main(Point, methods.LR)
     chosen, given, papers = ran[0].notes
-    assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 2000 (20000), ")
+    assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 1000 (10000), ")
     assert given == "LR, set by you: fit.batch_size 64 (512)"
     assert papers.startswith("LR, unlike the paper (see --paper-settings): fit.")
     assert "fit.mean_latent False (True)" in papers
@@ -309,7 +315,7 @@ def test_nan_in_the_experience_is_refused(copy: Path, capsys) -> None:
     forget(copy, "test-LR", "LR", "replay")
     chunk = stage_of(copy, "experience-PPO") / "experience" / "chunk_00000"
     tree, meta = load_arrays(chunk)
-    tree["o"][3, 2, 1] = np.nan
+    tree["o"][-3, 2, 1] = np.nan
     save_arrays(chunk, tree, meta, overwrite=True)
     refused(copy, capsys, "o holds NaN")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import json
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from killing import Killed, dies_at
 from point import Point
+from small_cells import counted
 from tiny import AGENTS, TEST, tiny
 
 from experiments import table1
@@ -32,9 +32,10 @@ from genidm.runs import cell as cell_module
 from genidm.runs import run as run_module
 from genidm.runs.cell import make_run, scenarios_of
 from genidm.runs.command import run_cli
+from genidm.tasks import WalkForward
 
 # One record for all that learn from one, and one policy.
-RECORD = dict(agent=AGENTS[RandomActions])
+RECORD = dict(agent=AGENTS[RandomActions], task=WalkForward(episode_steps=20))
 METHODS = [
     *(tiny(m, **RECORD) for m in (methods.HF, methods.LR, methods.RS)),
     tiny(methods.VGCP),
@@ -92,24 +93,6 @@ def stages(out: Path, glob: str) -> list[Path]:
     return sorted(path.parent for path in (out / "runs" / "point").glob(f"{glob}/done.json"))
 
 
-@contextlib.contextmanager
-def counted(*names: str) -> Iterator[Counter]:
-    """How often functions that make stages are called meanwhile."""
-    calls: Counter = Counter()
-
-    def counting(name, made):
-        def wrapped(*args, **kwargs):
-            calls[name] += 1
-            return made(*args, **kwargs)
-
-        return wrapped
-
-    with pytest.MonkeyPatch.context() as m:
-        for name in names:
-            m.setattr(run_module, name, counting(name, getattr(run_module, name)))
-        yield calls
-
-
 # ── what is run ─────────────────────────────────────────────────────────────────────────────
 
 
@@ -158,8 +141,7 @@ def test_what_is_done_is_not_done_again(copy: Path) -> None:
         return {p: p.stat().st_mtime_ns for p in paths}
 
     before = written()
-    names = ("collect", "replay", "fit", "run")
-    with counted(*names) as calls, pytest.MonkeyPatch.context() as m:
+    with counted() as calls, pytest.MonkeyPatch.context() as m:
         m.setattr(table1, "write_report", lambda this, tested_scenarios, options, own: copy)
         run(Point(), METHODS, options(copy))
     assert not calls
@@ -170,7 +152,7 @@ def test_a_whole_test_of_a_later_seed_stands_whoever_made_it(copy: Path) -> None
     """A lone command tests on all scenarios; the table then asks for no other test."""
     alone = make_run(Point(), METHODS[2], options(copy, seed=1))
     whole = alone.run_test(scenarios_of(alone, options(copy)))
-    with counted("run") as calls:
+    with counted() as calls:
         run(Point(), METHODS, options(copy))
     assert not calls
     over = results(copy)["methods"]["RS"]["training_seeds"]
@@ -300,7 +282,7 @@ def test_a_table_that_was_killed_goes_on(copy: Path, monkeypatch) -> None:
         with pytest.raises(Killed):
             run(Point(), METHODS, options(copy))
     assert not stages(copy, "LR-1-*")
-    with counted("collect", "fit", "run") as calls:
+    with counted() as calls:
         run(Point(), METHODS, options(copy))
     assert calls == Counter(fit=1, run=1)
     assert without_made(results(copy)) == without_made(whole)
