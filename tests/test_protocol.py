@@ -124,6 +124,8 @@ def test_every_fit_is_adam_at_1e_3_on_minibatches_of_512_and_lambda_is_a_quarter
         } == {(0.25, True, False)}
         assert {m.goal_horizon for m in papers} == {1}
         assert {(m.task, m.skip, m.labels) for m in papers} == {(WalkForward(), 0.0, "performed")}
+        agents = [m.agent.agent if isinstance(m.agent, Frozen) else m.agent for m in papers]
+        assert not any(getattr(agent, "mirror", False) for agent in agents)
         assert not any(m.nearest_side or m.mirror or m.clip_bearing for m in papers)
 
 

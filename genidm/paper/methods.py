@@ -134,6 +134,8 @@ class Choices:
       sac: settings of SAC.
       ddpg: settings of DDPG.
       walk: task of collection: a turning world.
+      mirror_agent: whether the collecting agent also learns from mirror images. So its gait is
+        nearly its own mirror image, and HF can learn from mirror images, too.
       skip: fraction of the record to leave out. An agent that still learns to walk has nothing to
         teach; a frozen agent's record has no such part.
       goal_horizon: h.
@@ -150,6 +152,7 @@ class Choices:
     sac: SAC = dataclasses.field(default_factory=SAC)
     ddpg: DDPG = dataclasses.field(default_factory=DDPG)
     walk: WalkForward = WALK
+    mirror_agent: bool = True
     skip: float = 0.5
     goal_horizon: int = 50
     goal_horizon_of_random: int = 100
@@ -231,7 +234,8 @@ def _of_random(method: InverseDynamics, choices: Choices) -> InverseDynamics:
 def _collector(robot: str, choices: Choices, training: protocol.Training) -> Agent | Frozen:
     if training.algorithm is None:
         return RandomActions()
-    agent = choices.agent(training)
+    plain: Any = choices.agent(training)
+    agent = dataclasses.replace(plain, mirror=choices.mirror_agent)
     before = protocol.LEARNED_BEFORE.get(robot)
     if before is None:
         return agent
@@ -307,6 +311,8 @@ def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
     first part of the record (A.1.2). The networks are those of Table 2 where it has the method and
     the robot.
 
+    The agent does not learn from mirror images.
+
     Args:
       method: the method.
       robot: name of the robot.
@@ -327,6 +333,7 @@ def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
     return dataclasses.replace(
         method,
         name=f"{name} paper",
+        agent=_without_mirror(method.agent),
         task=WALK,
         fraction=protocol.FRACTION.get(name, 1.0),
         skip=0.0,
@@ -338,3 +345,10 @@ def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
         fit=fit,
     )
+
+
+def _without_mirror(agent: Any) -> Any:
+    """An agent that learns from what it does alone."""
+    if isinstance(agent, Frozen):
+        return dataclasses.replace(agent, agent=_without_mirror(agent.agent))
+    return dataclasses.replace(agent, mirror=False) if hasattr(agent, "mirror") else agent

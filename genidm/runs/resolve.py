@@ -81,12 +81,11 @@ def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
 
 
 def _at_scale(agent: Any, scale: Scale) -> Any:
-    """Replaces PPO at default settings by the scale's, keeping its layers; other agents stay."""
+    """Replaces PPO at default settings by the scale's, keeping layers and mirror; others stay."""
     if not isinstance(agent, PPO):
         return agent
-    layers = agent.policy_hidden_layer_sizes
-    usual = agent == PPO(policy_hidden_layer_sizes=layers)
-    return dataclasses.replace(scale.ppo, policy_hidden_layer_sizes=layers) if usual else agent
+    kept = {name: getattr(agent, name) for name in ("policy_hidden_layer_sizes", "mirror")}
+    return dataclasses.replace(scale.ppo, **kept) if agent == PPO(**kept) else agent
 
 
 def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
