@@ -122,7 +122,9 @@ def held_out_error(
         np.asarray(jnp.mean((act(s, way) - a) ** 2, axis=-1)) / variance
         for way in (d, symmetry.rotate_vector(d, turn))
     )
-    nearest = fitted and _nearest(robot, some, _draw(fitted, AMONG, rng)) / variance
+    nearest = None
+    if fitted is not None:
+        nearest = _nearest(robot, some, _draw(fitted, AMONG, rng)) / variance
     return HeldOut(
         samples=len(a),
         error=float(error.mean()),
