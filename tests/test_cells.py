@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bits import truncate
 from point import Point
@@ -52,6 +53,22 @@ def test_the_report_is_there(finished: Finished) -> None:
     lines = (finished.report / "table.txt").read_text().splitlines()
     rows = [line.split()[0] for line in lines if line[:2] in ("RS", "GE", "LR") and "±" in line]
     assert rows == ["RS", "GE", "LR"] and "paths.png" in lines[-1]
+
+
+def test_a_fit_keeps_its_error_on_what_it_has_not_seen(finished: Finished) -> None:
+    for method in ("RS", "GE", "LR"):
+        stage = stage_of(finished.out, f"{method}-0")
+        found, summary = json.loads((stage / "held_out.json").read_text()), Stage(stage).summary()
+        totals = {name: found[name] for name in ("samples", "error", "shuffled", "nearest")}
+        assert summary["held_out"] == totals and min(totals.values()) > 0
+        made = controller.load(stage / "controller", Point())
+        np.testing.assert_array_equal(np.float32(summary["bearings"]), made.bearings)
+        row = finished.results["methods"][method]
+        assert row["held_out"] == {name: pytest.approx(x, abs=1e-6) for name, x in totals.items()}
+        assert row["bearings"] == pytest.approx(summary["bearings"], abs=1e-6)
+    table = (finished.report / "table.txt").read_text()
+    assert "Held-out action error of the fits" in table and "Bearings of 98 %" in table
+    assert (finished.report / "held_out.png").exists()
 
 
 def test_results_hold_what_the_table_is_made_of(finished: Finished) -> None:

@@ -493,6 +493,37 @@ def test_bearings_show_the_mean_of_each_bin(tmp_path):
     assert behind.get_ydata() == pytest.approx([1.0] * 3 + [0.25] * 6 + [1.0] * 3)
 
 
+def test_held_out_errors_stand_in_their_bins_above_the_ranges(tmp_path):
+    bins = {"edges": [-180, -60, 60, 180], "error": [None, 0.25, 0.5], "shuffled": [None, 0.5, 2.0]}
+    turned = bins | {"edges": [-180, 0, 90, 180]}
+    path = tmp_path / "held_out.png"
+    fig = report.draw_held_out(
+        {"LR": {"bearing": bins, "heading": turned}}, {"LR": np.radians([-30, 60])}, path
+    )
+    drawn(fig, path)
+    for ax, middle in zip(fig.axes, ([-120, 0, 120], [-90, 45, 135]), strict=True):
+        error, shuffled, mean = ax.lines
+        for line, values in ((error, [0.25, 0.5]), (shuffled, [0.5, 2.0])):
+            assert list(line.get_xdata()) == middle
+            assert np.isnan(line.get_ydata()[0]) and list(line.get_ydata()[1:]) == values
+        assert (shuffled.get_linestyle(), list(mean.get_ydata())) == (":", [1, 1])
+    left, right = fig.axes
+    (seen,) = left.collections[0].get_segments()
+    assert seen[:, 0] == pytest.approx([-30, 60]) and (seen[:, 1] < 0).all()
+    assert left.get_ylim()[0] < seen[0, 1] and left.get_yticks()[0] == 0
+    assert not right.collections
+
+
+def test_notes_say_how_a_row_was_fitted(rows):
+    held_out = {"samples": 900, "error": 0.3333333, "shuffled": 0.5, "nearest": None}
+    rows[1] = dataclasses.replace(rows[1], held_out=held_out, bearings=(-0.5235988, np.pi))
+    results = document(rows)
+    assert results["methods"]["RL"]["held_out"] == held_out | {"error": 0.333333}
+    notes = " ".join(table.text(results).split())
+    assert "(in brackets: with d shuffled): RL 0.33 (0.50)." in notes
+    assert "from the heading: RL −30° to 180°." in notes
+
+
 def test_styles_are_one_a_method_and_told_apart_without_colour():
     known = drawing.styles(drawing.STYLES)
     assert known == drawing.STYLES

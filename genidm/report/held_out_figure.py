@@ -35,21 +35,17 @@ def draw_held_out(
     fig = Figure(figsize=(9.0, 3.9), layout="constrained")
     left, right = fig.subplots(1, 2, sharey=True)
     looks = styles(errors)
-    for row, (name, found) in enumerate(errors.items()):
+    for name, found in errors.items():
         _lines(left, found["bearing"], looks[name])
         _lines(right, found["heading"], looks[name])
-        if name in bearings:
-            ends, height = np.degrees(bearings[name]), -0.06 * (row + 1)
-            left.plot(ends, [height, height], color=looks[name].colour, linewidth=3)
     for ax in (left, right):
         ax.axhline(1, **MEAN)
         ax.set(xlim=(-180, 180), xticks=np.arange(-180, 181, 60))
-    left.set_yticks([tick for tick in left.get_yticks() if tick >= 0])
-    left.set_ylim(-0.06 * (len(errors) + 1), None)
+    _ranges(left, bearings, looks)
     drawing.style_axes(
         left,
         "bearing of d from the heading, degrees (left is positive)",
-        "action error / variance",
+        "held-out action error / variance",
     )
     drawing.style_axes(right, "heading in the world, degrees", "")
     drawing.line_key(fig, looks, _key(bool(bearings)))
@@ -61,6 +57,17 @@ def _lines(ax: Axes, bins: Mapping[str, Any], style: Style) -> None:
     middle = (edges[:-1] + edges[1:]) / 2
     ax.plot(middle, np.array(bins["error"], float), **drawing.strokes(style), markersize=5)
     ax.plot(middle, np.array(bins["shuffled"], float), **drawing.strokes(style) | SHUFFLED)
+
+
+def _ranges(ax: Axes, bearings: Mapping[str, Sequence[float]], looks: Mapping[str, Style]) -> None:
+    """Draws the ranges below 0, one below the other."""
+    ax.set_ylim(bottom=0)
+    top = ax.get_ylim()[1]
+    row = 0.035 * top
+    ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick <= top])
+    ax.set_ylim(-row * (len(bearings) + 1), top)
+    for number, (name, ends) in enumerate(bearings.items(), 1):
+        ax.hlines(-row * number, *np.degrees(ends), color=looks[name].colour, linewidth=3)
 
 
 def _key(ranges: bool) -> list[Line2D]:

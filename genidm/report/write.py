@@ -117,7 +117,7 @@ def _draw(
         keys = ["loss_action", "loss_latent"]
         figures.learning_curves(shown.fitting, at("fitting"), keys, "updates")
     if shown.held_out:
-        ranges = {row.method: row.bearings for row in rows if row.bearings is not None}
+        ranges = {r.method: r.bearings for r in rows if r.bearings and r.method in shown.held_out}
         draw_held_out(shown.held_out, ranges, at("held_out"))
     if shown.changes:
         figures.invariance(shown.changes, ANGLES, at("invariance"))
