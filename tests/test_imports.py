@@ -29,6 +29,7 @@ engines
 robots.base robots.minitaur_world
 robots.mujoco
 robots.*
+robots.ant_v2
 robots.minitaur_env
 robots
 rollout tasks
@@ -57,6 +58,7 @@ report.table report.drawing
 report.figures report.waypoint_figure report.held_out_figure
 report
 paper.methods
+paper.author
 runs.scale
 runs.resolve runs.run
 runs.recording

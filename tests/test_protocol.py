@@ -135,7 +135,8 @@ def test_a_1_3() -> None:
     assert (paper.seeds, paper.episodes) == (10, 1000)
     ranges = {name: robot.target_distance for name, robot in ROBOTS.items()}
     assert ranges == {
-        "ant": (2, 5), "humanoid": (2, 5), "humanoid_world": (2, 5), "minitaur": (1.5, 2.5),
+        "ant": (2, 5), "ant_v2": (2, 5), "humanoid": (2, 5), "humanoid_world": (2, 5),
+        "minitaur": (1.5, 2.5),
     }  # fmt: skip
     robot = Ant(engine="mujoco")
     tested_scenarios = scenarios(robot, 2, 200)

@@ -13,6 +13,7 @@ import numpy as np
 from genidm.checks import check_value, count, seed
 from genidm.paper.protocol import TARGET_BEARING, TEST_EPISODES, TEST_SEEDS
 from genidm.robots.base import Robot
+from genidm.symmetry import rotate_vector
 from genidm.tasks import ahead
 
 
@@ -47,6 +48,12 @@ SCENARIO_KEY = 0x7E57
 # All starts are in memory at once: 1 GB for this many of the Ant, 100 times the paper's test.
 MOST_EPISODES = 10**6
 
+Range = tuple[float, float]
+# The test of the author's code (docs/authors.md): metres ahead and to the left of the start.
+BOX_AHEAD: Range = (2.0, 4.0)
+BOX_SIDE: Range = (-2.0, 2.0)
+BOX_EPISODES = 100
+
 
 def scenarios(
     robot: Robot, seeds: int = TEST_SEEDS, episodes: int = TEST_EPISODES, first_seed: int = 0
@@ -66,32 +73,64 @@ def scenarios(
       BadInput: there is no episode, or there are more than `MOST_EPISODES`, or a seed is not
         of 32 bits.
     """
+    numbers = _numbered(seeds, episodes, first_seed)
+    bearings = (-TARGET_BEARING, TARGET_BEARING)
+    return toward(robot, *_draw(*numbers, robot.target_distance, bearings))
+
+
+def box_scenarios(
+    robot: Robot, seeds: int = TEST_SEEDS, episodes: int = BOX_EPISODES, first_seed: int = 0
+) -> Scenarios:
+    """Make the test of the author's code (docs/authors.md): targets in a box ahead of the robot.
+
+    A target is 2–4 m ahead of the start and up to 2 m to its left or right, in the frame of the
+    start's yaw; the heading differs from it by the reset noise. The target has the height of the
+    start. In the author's test, reaching does not end an episode: `goal_radius` is 0.
+
+    Args:
+      robot: the robot.
+      seeds: number of test seeds.
+      episodes: episodes per seed.
+      first_seed: first test seed.
+
+    Raises:
+      BadInput: as `scenarios`.
+    """
+    keys, yaw, forward, left = _draw(*_numbered(seeds, episodes, first_seed), BOX_AHEAD, BOX_SIDE)
+    start = jax.jit(robot.reset)(keys.reshape(-1), yaw.reshape(-1)).position
+    offset = jnp.stack([forward, left, jnp.zeros_like(left)], axis=-1)
+    target = start.reshape(offset.shape) + rotate_vector(offset, yaw)
+    return Scenarios(keys, yaw, target.astype(jnp.float32))
+
+
+def _numbered(seeds: int, episodes: int, first_seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The test seeds and the numbers of their episodes, after a check."""
     check_value("seeds of a test", seeds, count())
     check_value("episodes of a test", episodes, count())
     check_value("seeds × episodes of a test", seeds * episodes, count(1, MOST_EPISODES))
     check_value("first seed of a test", first_seed, seed())
     check_value("last seed of a test", first_seed + seeds - 1, seed())
     numbers = np.arange(first_seed, first_seed + seeds).astype(np.uint32)
-    return _scenarios(robot, numbers, np.arange(episodes, dtype=np.uint32))
+    return numbers, np.arange(episodes, dtype=np.uint32)
 
 
-def _scenarios(robot: Robot, seeds: np.ndarray, episodes: np.ndarray) -> Scenarios:
+def _draw(
+    seeds: np.ndarray, episodes: np.ndarray, first: Range, second: Range
+) -> tuple[jax.Array, ...]:
+    """Keys of the starts, yaws in ±π, and numbers in two ranges, `[seeds, episodes]` each."""
+
     def one(seed: jax.Array, episode: jax.Array) -> tuple[jax.Array, ...]:
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(SCENARIO_KEY), seed), episode)
-        start, turn, far, side = jax.random.split(key, 4)
-        low, high = robot.target_distance
-        return (
-            start,
-            jax.random.uniform(turn, (), jnp.float32, minval=-jnp.pi, maxval=jnp.pi),
-            jax.random.uniform(far, (), jnp.float32, minval=low, maxval=high),
-            jax.random.uniform(
-                side, (), jnp.float32, minval=-TARGET_BEARING, maxval=TARGET_BEARING
-            ),
+        start, *keys = jax.random.split(key, 4)
+        ranges = ((-jnp.pi, jnp.pi), first, second)
+        return start, *(
+            jax.random.uniform(key, (), jnp.float32, minval=low, maxval=high)
+            for key, (low, high) in zip(keys, ranges, strict=True)
         )
 
     grid = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
-    keys, yaw, distance, bearing = jax.jit(grid)(seeds, episodes)
-    return toward(robot, keys, yaw, distance, bearing)
+    drawn: tuple[jax.Array, ...] = jax.jit(grid)(seeds, episodes)
+    return drawn
 
 
 def toward(

@@ -47,7 +47,8 @@ class Fit:
       idm: hidden layers of φ (Table 2).
       lfm: hidden layers of ψ (Table 2).
       network: "mlp": fully connected layers (Table 2); "residual": a block with layer
-        normalisation in place of each layer.
+        normalisation in place of each layer; "author": as in the author's code, ψ ends in ReLU
+        and φ in tanh (docs/authors.md).
       weight_decay: of AdamW; 0 is the paper's Adam.
       latent_size: k (Eq. 3); None fits an IDM without an LFM.
       latent_loss_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).

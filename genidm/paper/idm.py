@@ -7,6 +7,8 @@ in place of (s, o, o') (Remark 2). Eq. 2 is in `pairs`.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
 import flax.linen as nn
@@ -59,8 +61,40 @@ class ResidualMLP(nn.Module):
         return nn.Dense(self.outputs)(nn.LayerNorm()(x))
 
 
-Network = Literal["mlp", "residual"]
-NETWORKS: dict[Network, type[MLP] | type[ResidualMLP]] = {"mlp": MLP, "residual": ResidualMLP}
+class AuthorMLP(nn.Module):
+    """The networks of the author's code (docs/authors.md): an MLP that ends in an activation.
+
+    Weights are Xavier uniform and biases 0.01 at the start.
+
+    Attributes:
+      hidden_layer_sizes: widths of the hidden layers, which end in ReLU.
+      outputs: width of the output.
+      end: activation of the output.
+    """
+
+    hidden_layer_sizes: tuple[int, ...]
+    outputs: int
+    end: Callable[[jax.Array], jax.Array]
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        ends = [nn.relu] * len(self.hidden_layer_sizes) + [self.end]
+        weights, biases = nn.initializers.xavier_uniform(), nn.initializers.constant(0.01)
+        for width, end in zip((*self.hidden_layer_sizes, self.outputs), ends, strict=True):
+            x = end(nn.Dense(width, kernel_init=weights, bias_init=biases)(x))
+        return x
+
+
+Network = Literal["mlp", "residual", "author"]
+# Network → its ψ and its φ, each called as (hidden layers, outputs).
+NETWORKS: dict[Network, tuple[Callable[..., nn.Module], Callable[..., nn.Module]]] = {
+    "mlp": (MLP, MLP),
+    "residual": (ResidualMLP, ResidualMLP),
+    "author": (
+        functools.partial(AuthorMLP, end=nn.relu),
+        functools.partial(AuthorMLP, end=nn.tanh),
+    ),
+}
 
 
 def _apply(model: Any, params: Any, x: jax.Array) -> jax.Array:
@@ -78,7 +112,7 @@ class Architecture:
       idm: hidden layers of φ.
       lfm: hidden layers of ψ; unused without a latent.
       latent_size: k, or None for an IDM without LFM (RS, RL, GE).
-      network: "mlp" (the paper's), or "residual".
+      network: "mlp" (the paper's), "residual", or "author".
     """
 
     action_size: int
@@ -98,11 +132,11 @@ class Architecture:
             "idm": self._idm().init(phi, jnp.zeros(self.latent_size, jnp.float32)),
         }
 
-    def _idm(self) -> MLP | ResidualMLP:
-        return NETWORKS[self.network](self.idm, self.action_size)
+    def _idm(self) -> nn.Module:
+        return NETWORKS[self.network][1](self.idm, self.action_size)
 
-    def _lfm(self) -> MLP | ResidualMLP:
-        return NETWORKS[self.network](self.lfm, self.latent_size or 0)
+    def _lfm(self) -> nn.Module:
+        return NETWORKS[self.network][0](self.lfm, self.latent_size or 0)
 
     def latent(self, params: dict, s: jax.Array, d: jax.Array) -> jax.Array:
         """Compute ψ(s, d) = γ `[..., k]` (Def. 5, Eq. 3); without an LFM, (s, d) `[..., S + 3]`.

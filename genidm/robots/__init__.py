@@ -6,13 +6,14 @@ from typing import Any, TypeVar
 from genidm import registry
 from genidm.errors import BadInput
 from genidm.robots.ant import Ant
+from genidm.robots.ant_v2 import AntV2
 from genidm.robots.base import Robot, State
 from genidm.robots.humanoid import Humanoid, HumanoidWorld
 from genidm.robots.logged import Logged
 from genidm.robots.minitaur import Minitaur
 
 ROBOTS: dict[str, type[Robot]] = {
-    robot.name: robot for robot in (Ant, Humanoid, HumanoidWorld, Minitaur)
+    robot.name: robot for robot in (Ant, AntV2, Humanoid, HumanoidWorld, Minitaur)
 }
 
 
@@ -84,6 +85,7 @@ def _like(model: Any, value: Any) -> Any:
 __all__ = [
     "ROBOTS",
     "Ant",
+    "AntV2",
     "Humanoid",
     "HumanoidWorld",
     "Logged",
