@@ -19,6 +19,7 @@ from genidm.evaluation.scenarios import BOX_EPISODES, box_scenarios
 from genidm.paper import protocol
 from genidm.paper.author import EPOCHS, author_settings
 from genidm.paper.methods import LR, InverseDynamics
+from genidm.paper.protocol import FRACTION
 from genidm.robots import AntV2, Robot
 from genidm.runs.cell import announce, make_run, print_notes, render_run, write_report
 from genidm.runs.command import run_cli
@@ -42,7 +43,7 @@ class Authors(Options):
         default_factory=lambda: EvaluationSettings(goal_radius=0.0)
     )
     epochs: int = EPOCHS
-    fraction: float = LR.fraction
+    fraction: float = FRACTION["LR"]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,10 +54,8 @@ class Authors(Options):
 
 def row(robot: Robot, method: InverseDynamics, options: Authors) -> InverseDynamics:
     """The method of the row; its name has the settings that are not the author's."""
-    chosen = author_settings(
-        dataclasses.replace(method, fraction=options.fraction), robot, options.epochs
-    )
-    own = {"epochs": (options.epochs, EPOCHS), "fraction": (options.fraction, method.fraction)}
+    chosen = author_settings(method, robot, options.epochs, options.fraction)
+    own = {"epochs": (options.epochs, EPOCHS), "fraction": (options.fraction, FRACTION["LR"])}
     named = [f" {name} {value:g}" for name, (value, usual) in own.items() if value != usual]
     return dataclasses.replace(chosen, name="".join([chosen.name, *named]))
 

@@ -13,14 +13,16 @@ import math
 from genidm.checks import check_value, count
 from genidm.paper.fit import Fit
 from genidm.paper.methods import InverseDynamics, paper_settings
-from genidm.robots.base import Robot
+from genidm.robots import Ant, Robot
 
 EPOCHS = 1000
 # A fifth of the pairs is only validated on.
 LEARNED = 4 / 5
 
 
-def author_settings(method: InverseDynamics, robot: Robot, epochs: int = EPOCHS) -> InverseDynamics:
+def author_settings(
+    method: InverseDynamics, robot: Robot, epochs: int = EPOCHS, fraction: float | None = None
+) -> InverseDynamics:
     """Give a method the settings of the author's code.
 
     They are the paper's (`paper_settings`: h = 1, whole-episode replay, λ = 0.25, mean latents,
@@ -28,16 +30,20 @@ def author_settings(method: InverseDynamics, robot: Robot, epochs: int = EPOCHS)
     losses, and with as many minibatches as the epochs have.
 
     Args:
-      method: a method of Table 1.
-      robot: its robot, for A and the number of interactions.
+      method: a method of Table 1, on the Ant.
+      robot: its Ant, for A and the number of interactions.
       epochs: passes over the pairs; the default is the author's.
+      fraction: fraction of the record, from its start, that makes the pairs; the default is the
+        paper's.
 
     Raises:
       BadInput: there is no epoch.
     """
     check_value("epochs", epochs, count())
-    papers = paper_settings(method)
-    pairs = LEARNED * method.fraction * robot.paper_interactions
+    papers = paper_settings(method, Ant.name)
+    if fraction is not None:
+        papers = dataclasses.replace(papers, fraction=fraction)
+    pairs = LEARNED * papers.fraction * robot.paper_interactions
     updates = epochs * math.ceil(pairs / papers.fit.batch_size)
     fit = dataclasses.replace(papers.fit, network="author", updates=updates)
     return dataclasses.replace(
