@@ -138,12 +138,11 @@ def reference(name: str, learner: Learner) -> dict[str, np.ndarray]:
     for there, here in NAMES.items():
         if there in config:
             config[there] = getattr(learner, here)
-    params, target = fixed(learner)
-    batch = numbers()
+    params, target, batch = jax.tree.map(np.float64, (*fixed(learner), numbers()))
     agent = getattr(module, f"{name.upper()}Agent")
     agent = agent.create(0, batch["observations"], batch["actions"], config)
     start = jax.tree.map(jax.numpy.asarray, theirs(params, target))
-    assert trees.kinds(start) == trees.kinds(agent.network.params)
+    assert jax.tree.map(np.shape, start) == jax.tree.map(np.shape, agent.network.params)
     agent = agent.replace(network=agent.network.replace(params=start))
     grads, info = jax.grad(lambda p: agent.total_loss(batch, p), has_aux=True)(start)
     loss, _ = agent.total_loss(batch, start)
@@ -160,7 +159,8 @@ def reference(name: str, learner: Learner) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Writes the file."""
+    """Writes the file, computed in float64."""
+    jax.config.update("jax_enable_x64", True)
     found = {
         f"{name}.{key}": np.asarray(x, np.float32)
         for name, learner in LEARNERS.items()

@@ -69,8 +69,11 @@ def learned(name: str) -> tuple[Learner, dict, dict]:
     return learner, *reference.fixed(learner)
 
 
-def close(here: Any, there: np.ndarray, rtol: float = 2e-5) -> None:
-    """Equal but for float32's rounding, against the largest number."""
+def close(here: Any, there: np.ndarray, rtol: float = 1e-4) -> None:
+    """Equal but for float32's rounding, against the largest number.
+
+    In float64, losses and gradients of all four agree with OGBench's to 2e-14.
+    """
     here = np.asarray(here)
     assert here.shape == there.shape
     np.testing.assert_allclose(here, there, rtol=0, atol=rtol * np.abs(there).max())
@@ -101,11 +104,12 @@ def test_updates_move_parameters_and_targets_as_those_of_ogbench(name: str) -> N
         params, target = optax.apply_updates(params, step), learner.moved(target, params)
     start, start_target = reference.fixed(learner)
     moved = theirs(name)["params"] - reference.flat(start)
-    close(reference.flat(params) - reference.flat(start), moved, 4e-3)
+    # Adam divides by the size of the gradient, which also magnifies its rounding.
+    close(reference.flat(params) - reference.flat(start), moved, 2e-2)
     assert np.abs(moved).max() > 2 * learner.learning_rate
     if target:
         slowly = theirs(name)["target"] - reference.flat(start_target)
-        close(reference.flat(target) - reference.flat(start_target), slowly, 1e-3)
+        close(reference.flat(target) - reference.flat(start_target), slowly, 5e-5)
 
 
 @LEARNERS
