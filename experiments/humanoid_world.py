@@ -17,7 +17,7 @@ import tyro
 
 from experiments import table1
 from genidm.experience import Experience
-from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.offline.methods import AnyMethod
 from genidm.robots import Humanoid, HumanoidWorld, Robot
 from genidm.runs.cell import make_run
 from genidm.runs.command import run_cli
@@ -70,9 +70,7 @@ class ConvertedRun(InverseDynamicsRun):
         return summary
 
 
-def converted(
-    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
-) -> Run[Any]:
+def converted(robot: Robot, method: AnyMethod, options: Options) -> Run[Any]:
     """The run of a method on HumanoidWorld, on the experience of the same run on the Humanoid."""
     source = make_run(Humanoid(engine=options.engine), method, options)
     run = make_run(robot, method, options)

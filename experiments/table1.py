@@ -15,7 +15,8 @@ import tyro
 from genidm.checks import check, count
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import EXTRA, ORDER, GoalConditioned, InverseDynamics, by_name
+from genidm.offline.methods import AnyMethod, by_name
+from genidm.paper.methods import EXTRA, ORDER
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
 from genidm.runs.cell import announce, make_run, render_run, scenarios_of, write_report
@@ -24,8 +25,8 @@ from genidm.runs.resolve import Options
 from genidm.runs.run import Run
 from genidm.store import Stage
 
-Methods = Sequence[GoalConditioned | InverseDynamics]
-MakeRun = Callable[[Robot, GoalConditioned | InverseDynamics, Options], Run[Any]]
+Methods = Sequence[AnyMethod]
+MakeRun = Callable[[Robot, AnyMethod, Options], Run[Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Table(Options):
         check(self, seeds=count(), episodes_per_extra_seed=count())
 
 
-def chosen(options: Table) -> list[GoalConditioned | InverseDynamics]:
+def chosen(options: Table) -> list[AnyMethod]:
     """The methods to run, without duplicates.
 
     Raises:
@@ -66,7 +67,7 @@ def chosen(options: Table) -> list[GoalConditioned | InverseDynamics]:
     return rows
 
 
-def grouped(methods: Methods) -> list[GoalConditioned | InverseDynamics]:
+def grouped(methods: Methods) -> list[AnyMethod]:
     """Sorts methods so that those with the same experience follow each other."""
     sources = [(method.agent, method.task) for method in methods]
     return sorted(methods, key=lambda method: sources.index((method.agent, method.task)))

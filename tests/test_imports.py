@@ -18,7 +18,7 @@ ORDER = """
 errors evaluation.episodes quiet paper.protocol
 checks devices registry trees renamed
 symmetry
-evaluation paper runs
+evaluation offline paper runs
 config
 files
 checkpoints progress provenance
@@ -43,7 +43,10 @@ agents
 agents.collect
 paper.replaying
 paper.pairs
-paper.generalize paper.idm
+paper.generalize paper.idm offline.networks offline.data
+offline.policy offline.learner
+offline.gcbc offline.implicit offline.crl
+offline.gcivl offline.hiql
 controller
 paper.fit
 evaluation.scenarios
@@ -55,9 +58,11 @@ report.rows
 report.table report.drawing
 report.figures report.waypoint_figure
 report
-paper.methods
+paper.methods offline.train
+offline.methods
 runs.scale
 runs.resolve runs.run
+runs.offline
 report.runs
 report.shown
 report.write

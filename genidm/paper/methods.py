@@ -53,13 +53,28 @@ class GoalConditioned(Method):
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseDynamics(Method):
-    """Inverse dynamics (§4): a controller fitted to experience without goals.
+class FromRecord(Method):
+    """A method that learns a controller from a record of experience without goals.
 
     Attributes:
       fraction: fraction of the record, from its start, to learn from. For the paper's GE and
         LR, 𝒢 makes the other half (A.1.2).
       generalize: settings of 𝒢; None learns from the record only.
+    """
+
+    fraction: float
+    generalize: Generalize | None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, fraction=positive(1))
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseDynamics(FromRecord):
+    """Inverse dynamics (§4): a controller fitted to experience without goals.
+
+    Attributes:
       goal_horizon: h, steps to the intermediate goal o' (Def. 1); 1 is the paper's "next
         position". Steps whose episode ends earlier are left out.
       mirror: add the reflection of every sample; not in the paper.
@@ -67,8 +82,6 @@ class InverseDynamics(Method):
       fit: networks and losses.
     """
 
-    fraction: float
-    generalize: Generalize | None
     goal_horizon: int
     mirror: bool
     input_frame: Frame
@@ -76,7 +89,7 @@ class InverseDynamics(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, fraction=positive(1), goal_horizon=count())
+        check(self, goal_horizon=count())
 
 
 Methods = tuple[GoalConditioned | InverseDynamics, ...]

@@ -12,15 +12,24 @@ from genidm.checks import shown
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import ControllerFn
 from genidm.evaluation.scenarios import Scenarios, scenarios
+from genidm.offline.methods import AnyMethod, OfflineGoalConditioned
 from genidm.paper.methods import GoalConditioned, InverseDynamics
 from genidm.robots import Robot, by_name
+from genidm.runs.offline import OfflineRun
 from genidm.runs.resolve import Options, resolve, who_set_what
 from genidm.runs.run import GoalConditionedRun, InverseDynamicsRun, Run
 from genidm.runs.scale import scale_of
 from genidm.store import Stage
 
+# Kind of method → its run.
+KINDS: dict[type, Any] = {
+    GoalConditioned: GoalConditionedRun,
+    InverseDynamics: InverseDynamicsRun,
+    OfflineGoalConditioned: OfflineRun,
+}
 
-def make_run(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Run[Any]:
+
+def make_run(robot: Robot, method: AnyMethod, options: Options) -> Run[Any]:
     """Makes the run of a method, with its settings adapted to scale and machine (`resolve`)."""
     chosen = resolve(robot, method, options)
     return make_exact_run(robot, chosen, options, who_set_what(method, chosen, chosen))
@@ -28,7 +37,7 @@ def make_run(robot: Robot, method: GoalConditioned | InverseDynamics, options: O
 
 def make_exact_run(
     robot: Robot,
-    method: GoalConditioned | InverseDynamics,
+    method: AnyMethod,
     options: Options,
     notes: tuple[str, ...] = (),
 ) -> Run[Any]:
@@ -53,11 +62,12 @@ def make_exact_run(
         root=options.run_dir / robot.name, test=options.test,
         notes=notes, other_code=options.other_code,
     )  # fmt: skip
-    kind: Any = GoalConditionedRun if isinstance(method, GoalConditioned) else InverseDynamicsRun
-    return kind(method=method, **given)
+    kind = next(run for of, run in KINDS.items() if isinstance(method, of))
+    made: Run[Any] = kind(method=method, **given)
+    return made
 
 
-def run_method(robot: Robot, method: GoalConditioned | InverseDynamics, options: Options) -> Path:
+def run_method(robot: Robot, method: AnyMethod, options: Options) -> Path:
     """Runs a method, with its settings adapted to scale and machine, and writes the report.
 
     Returns:

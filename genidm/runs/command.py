@@ -16,14 +16,14 @@ import tyro
 from genidm import devices
 from genidm.checkpoints import requested_seconds
 from genidm.errors import BadInput, sentence
-from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.offline.methods import AnyMethod
 from genidm.renamed import refuse
 from genidm.robots import Robot
 from genidm.runs.cell import execute, make_exact_run
 from genidm.runs.resolve import Options, resolve, who_set_what
 
 
-def main(robot: Callable[..., Robot], method: GoalConditioned | InverseDynamics) -> None:
+def main(robot: Callable[..., Robot], method: AnyMethod) -> None:
     """The command line of one cell of Table 1: `python -m experiments.ant_lr`.
 
     The flags are parsed twice: first scale and engine, which set the defaults of the method's
@@ -48,14 +48,14 @@ def _early(options: Annotated[Options, tyro.conf.arg(name="")] = Options()) -> O
 
 
 def _settings(
-    method: GoalConditioned | InverseDynamics,
-) -> Callable[..., tuple[Options, GoalConditioned | InverseDynamics]]:
+    method: AnyMethod,
+) -> Callable[..., tuple[Options, AnyMethod]]:
     """A function whose parameters are the flags of a run, for tyro."""
 
     def both(
         options: Annotated[Options, tyro.conf.arg(name="")] = Options(),
-        method: GoalConditioned | InverseDynamics = method,
-    ) -> tuple[Options, GoalConditioned | InverseDynamics]:
+        method: AnyMethod = method,
+    ) -> tuple[Options, AnyMethod]:
         return options, method
 
     return both

@@ -13,7 +13,8 @@ from genidm.checks import check, count, optional
 from genidm.config import flat, to_json
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import EvaluationSettings
-from genidm.paper.methods import GoalConditioned, InverseDynamics, paper_settings
+from genidm.offline.methods import AnyMethod, OfflineGoalConditioned
+from genidm.paper.methods import InverseDynamics, paper_settings
 from genidm.robots import Robot
 from genidm.runs.scale import Scale, scale_of
 
@@ -55,9 +56,7 @@ class Options:
         check(self, seed=checks.seed(), episodes=optional(count()))
 
 
-def resolve(
-    robot: Robot, method: GoalConditioned | InverseDynamics, options: Options
-) -> GoalConditioned | InverseDynamics:
+def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
     """Adapts a method's settings to the scale, the machine and the robot's engine.
 
     On the command line the result gives the defaults of the method's flags, so a value that the
@@ -70,13 +69,14 @@ def resolve(
     agent = _at_scale(method.agent, scale)
     agent = agent if devices.memory() is None else agent.for_accelerator()
     method = dataclasses.replace(method, agent=agent)
-    if isinstance(method, GoalConditioned):
-        if options.paper_settings:
+    if options.paper_settings:
+        if not isinstance(method, InverseDynamics):
             raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
-        return method
-    method = _fitting(paper_settings(method) if options.paper_settings else method, scale)
-    if method.generalize:
-        method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+        method = paper_settings(method)
+    if isinstance(method, InverseDynamics | OfflineGoalConditioned):
+        if method.generalize:
+            method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+        return _fitting(method, scale)
     return method
 
 
@@ -89,27 +89,30 @@ def _at_scale(agent: Any, scale: Scale) -> Any:
     return dataclasses.replace(scale.ppo, policy_hidden_layer_sizes=layers) if usual else agent
 
 
-def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
+def _fitting(method: InverseDynamics | OfflineGoalConditioned, scale: Scale) -> AnyMethod:
     """Adapts updates, horizon and fractions to the scale's shorter record."""
     agent = method.agent
     if isinstance(agent, Frozen):
         agent = dataclasses.replace(
             agent, fraction=max(agent.fraction, scale.min_learning_fraction)
         )
-    updates = max(1, round(method.fit.updates * scale.updates))
-    return dataclasses.replace(
-        method,
-        agent=agent,
-        goal_horizon=min(method.goal_horizon, scale.goal_horizon),
-        fraction=max(method.fraction, scale.fraction),
-        fit=dataclasses.replace(method.fit, updates=updates),
-    )
+    changes: dict[str, Any] = dict(agent=agent, fraction=max(method.fraction, scale.fraction))
+    if isinstance(method, InverseDynamics):
+        changes["goal_horizon"] = min(method.goal_horizon, scale.goal_horizon)
+        changes["fit"] = _fewer_updates(method.fit, scale)
+    else:
+        changes["learner"] = _fewer_updates(method.learner, scale)
+    return dataclasses.replace(method, **changes)
+
+
+def _fewer_updates(settings: Any, scale: Scale) -> Any:
+    return dataclasses.replace(settings, updates=max(1, round(settings.updates * scale.updates)))
 
 
 def who_set_what(
-    method: GoalConditioned | InverseDynamics,
-    chosen: GoalConditioned | InverseDynamics,
-    given: GoalConditioned | InverseDynamics,
+    method: AnyMethod,
+    chosen: AnyMethod,
+    given: AnyMethod,
 ) -> tuple[str, ...]:
     """Says which settings of a run differ from the method's defaults or from the paper, and why.
 

@@ -1,6 +1,6 @@
 """The stages of a run (one cell of Table 1); a finished stage is skipped.
 
-    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        InverseDynamics methods
+    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        FromRecord methods
                                               policy ──────▶ test        GoalConditioned methods
 
 The name of a stage's directory contains a hash of all settings that the stage depends on:
@@ -14,7 +14,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ from genidm.agents.collect import collect, whole
 from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.policy import Policy
 from genidm.config import to_json
+from genidm.controller import Controller
 from genidm.errors import BadInput
 from genidm.evaluation import sanity
 from genidm.evaluation.episodes import Episodes
@@ -33,7 +34,7 @@ from genidm.evaluation.scenarios import Scenarios, fig8_scenarios
 from genidm.experience import Experience
 from genidm.paper.fit import fit
 from genidm.paper.generalize import replay, residual
-from genidm.paper.methods import GoalConditioned, InverseDynamics, Method
+from genidm.paper.methods import FromRecord, GoalConditioned, InverseDynamics, Method
 from genidm.paper.pairs import pairs
 from genidm.paper.replaying import RotatedReplay
 from genidm.provenance import code_of
@@ -42,6 +43,7 @@ from genidm.runs.scale import Scale
 from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
+R = TypeVar("R", bound=FromRecord)
 
 # Test episodes that are recorded for rendering.
 RECORDED_EPISODES = 3
@@ -52,6 +54,13 @@ TEST = (
     *("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.evaluation.sanity"),
     "genidm.controller",
 )
+
+
+class SavedController(Protocol):
+    """What a fit makes: a controller that `controller.load` reads."""
+
+    def save(self, path: Path | str, overwrite: bool = False) -> None:
+        """Write the controller as a directory."""
 
 
 class Trace(NamedTuple):
@@ -200,14 +209,20 @@ class Run(abc.ABC, Generic[M]):
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseDynamicsRun(Run[InverseDynamics]):
-    """The run of a method that fits an inverse dynamics model to experience.
+class RecordRun(Run[R]):
+    """The run of a method that learns a controller from a record of experience.
 
     Attributes:
-      repeat: number of an independent fit to the same pairs; 0 is the method's own fit.
+      repeat: number of an independent fit to the same record; 0 is the method's own fit.
+      made_by: modules that make the controller.
     """
 
     repeat: int = 0
+    made_by: ClassVar[tuple[str, ...]] = ()
+
+    @abc.abstractmethod
+    def fitted(self, record: Experience) -> SavedController:
+        """The controller that learns from `record`, with the `replay` of it."""
 
     @functools.cached_property
     def experience_stage(self) -> Stage:
@@ -304,7 +319,7 @@ class InverseDynamicsRun(Run[InverseDynamics]):
             del config[upstream]
         config = {"source": source.directory.name, "repeat": self.repeat} | config
         label = f"{self._label}-fit{self.repeat}" if self.repeat else self._label
-        return self._stage(label, config, "genidm.paper.fit", "genidm.paper.pairs")
+        return self._stage(label, config, *self.made_by)
 
     @property
     def sources(self) -> list[Stage]:
@@ -312,26 +327,21 @@ class InverseDynamicsRun(Run[InverseDynamics]):
         return [stage for stage in stages if stage]
 
     @property
-    def _fit_key(self) -> jax.Array:
+    def fit_key(self) -> jax.Array:
+        """Random key of the fit."""
         key = self._key(2)
         return jax.random.fold_in(key, self.repeat) if self.repeat else key
 
     def controller(self) -> ControllerFn:
-        """The fitted models; fitted if their stage is not finished."""
+        """The fitted controller; fitted if its stage is not finished."""
         stage = self.controller_stage
-        stage.run_once(self._fitted)
+        stage.run_once(self._fit)
         return stage.read(controller.load, "controller", self.robot)
 
-    def _fitted(self) -> dict[str, Any]:
+    def _fit(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
         record = self.experience().first_fraction(m.fraction).prepared(self.robot)
-        samples = pairs(
-            self.robot, record, self.replay(record), goal_horizon=m.goal_horizon, mirror=m.mirror
-        )
-        model = fit(
-            self.robot, samples, self._fit_key, m.fit, input_frame=m.input_frame, stage=stage
-        )
-        model.save(stage.path("controller"), overwrite=True)
+        self.fitted(record).save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,
             "method": m.name,
@@ -344,6 +354,20 @@ class InverseDynamicsRun(Run[InverseDynamics]):
 
     def _count(self, stage: Stage | None, what: str) -> int:
         return stage.summary()[what] if stage else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseDynamicsRun(RecordRun[InverseDynamics]):
+    """The run of a method that fits an inverse dynamics model to experience."""
+
+    made_by: ClassVar[tuple[str, ...]] = ("genidm.paper.fit", "genidm.paper.pairs")
+
+    def fitted(self, record: Experience) -> Controller:
+        m, stage = self.method, self.controller_stage
+        samples = pairs(
+            self.robot, record, self.replay(record), goal_horizon=m.goal_horizon, mirror=m.mirror
+        )
+        return fit(self.robot, samples, self.fit_key, m.fit, input_frame=m.input_frame, stage=stage)
 
 
 @dataclasses.dataclass(frozen=True)
