@@ -142,6 +142,11 @@ class Architecture:
         }
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the actors in the parameters."""
+        return ("actor",) if self.representation_size is None else ("high_actor", "low_actor")
+
+    @property
     def actor(self) -> Actor:
         """π(a | s, g), or the low level π(a | s, φ) of two."""
         return Actor(self.policy_hidden_layer_sizes, self.action_size)

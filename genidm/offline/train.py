@@ -102,8 +102,7 @@ def _start(
 def _policy(data: Dataset, params: Any, learner: Learner) -> GoalPolicy:
     """The controller of the trained actors; the values are left out."""
     architecture = learner.architecture(data.robot.action.size)
-    wanted = jax.eval_shape(architecture.init, jax.random.key(0), data.robot.observation.size)
-    actors = {name: params[name] for name in wanted}
+    actors = {name: params[name] for name in architecture.names}
     return GoalPolicy(actors, data.mean, data.std, longest_way(data), architecture, data.robot)
 
 
