@@ -86,7 +86,7 @@ class Dataset(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
 
     def at(self, sample: Sample, step: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """State `[n, S]` and position `[n, 3]` of a step, as the sample's view sees them.
+        """States `[..., n, S]` and positions `[..., n, 3]` of steps, as a sample's view sees them.
 
         Inside the sample's segment this is the replayed state; elsewhere, where the copy has
         another yaw, it is the record's own, rotated by the sample's yaw (as in `pairs`).
@@ -94,16 +94,16 @@ class Dataset(flax.struct.PyTreeNode):
         view, n = sample.view, sample.n
         if self.s.shape[0] == 1:
             return self.s[0, step], self.o[0, step]
-        yaw = self.yaw[view, n]
+        yaw = jnp.broadcast_to(self.yaw[view, n], step.shape)
         near = (self.segment[step] == self.segment[n]) & self.usable[view, step]
         s = self.robot.observation.rotate(self.s[0, step], yaw)
         o = symmetry.rotate_vector(self.o[0, step], yaw)
         # View 0 is the record itself: rotated by 0, its numbers would change by rounding.
-        near = (near | (view == 0))[:, None]
+        near = (near | (view == 0))[..., None]
         return jnp.where(near, self.s[view, step], s), jnp.where(near, self.o[view, step], o)
 
     def seen(self, sample: Sample, step: jax.Array, goal: jax.Array) -> jax.Array:
-        """Normalised network inputs (s, g − o) `[n, S + 3]` at a step, with the goal of another."""
+        """Normalised network inputs (s, g − o) `[..., n, S + 3]` at steps, with goals at others."""
         s, o = self.at(sample, step)
         return normalize(inputs(s, self.at(sample, goal)[1] - o), self.mean, self.std)
 

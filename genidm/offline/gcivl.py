@@ -64,15 +64,9 @@ class GCIVL(ImplicitValue):
         value_goal = draw_goals(data, value_key, n, self.value_goals, self.discounting)
         actor_goal = draw_goals(data, actor_key, n, self.actor_goals, self.discounting)
         away = 1.0 * (value_goal != n)
-        return Batch(
-            value=data.seen(sample, n, value_goal),
-            value_next=data.seen(sample, n + 1, value_goal),
-            actor=data.seen(sample, n, actor_goal),
-            actor_next=data.seen(sample, n + 1, actor_goal),
-            a=data.a[n],
-            reward=-away,
-            mask=away,
-        )
+        steps = jnp.stack([n, n + 1, n, n + 1])
+        goals = jnp.stack([value_goal, value_goal, actor_goal, actor_goal])
+        return Batch(*data.seen(sample, steps, goals), a=data.a[n], reward=-away, mask=away)
 
     def loss(self, params: Params, target: Params, batch: Batch) -> Loss:
         """L_V + L_π, with A = V(s', g) − V(s, g)."""
@@ -85,8 +79,9 @@ class GCIVL(ImplicitValue):
             self.discounting,
             self.expectile,
         )
-        fixed = functools.partial(value, jax.lax.stop_gradient(params["value"]))
-        advantage = fixed(batch.actor_next).mean(0) - fixed(batch.actor).mean(0)
+        fixed = jax.lax.stop_gradient(params["value"])
+        after, now = value(fixed, jnp.stack([batch.actor_next, batch.actor])).mean(0)
+        advantage = after - now
         actor = Actor(self.policy_hidden_layer_sizes, batch.a.shape[-1])
         mean = apply(actor, params["actor"], batch.actor)
         return together(value=loss_v, actor=loss_awr(mean, batch.a, advantage, self.alpha))

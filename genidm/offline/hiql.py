@@ -95,18 +95,9 @@ class HIQL(ImplicitValue):
         ahead = jnp.minimum(n + self.subgoal_steps, data.end[n])
         high_goal, subgoal = self._draw_high(data, high_key, n, ahead)
         away = 1.0 * (value_goal != n)
-        return Batch(
-            value=data.seen(sample, n, value_goal),
-            value_next=data.seen(sample, n + 1, value_goal),
-            low=data.seen(sample, n, ahead),
-            low_next=data.seen(sample, n + 1, ahead),
-            high=data.seen(sample, n, high_goal),
-            subgoal=data.seen(sample, n, subgoal),
-            high_next=data.seen(sample, subgoal, high_goal),
-            a=data.a[n],
-            reward=-away,
-            mask=away,
-        )
+        steps = jnp.stack([n, n + 1, n, n + 1, n, n, subgoal])
+        goals = jnp.stack([value_goal, value_goal, ahead, ahead, high_goal, subgoal, high_goal])
+        return Batch(*data.seen(sample, steps, goals), a=data.a[n], reward=-away, mask=away)
 
     def _draw_high(
         self, data: Dataset, key: jax.Array, n: jax.Array, ahead: jax.Array
@@ -131,10 +122,8 @@ class HIQL(ImplicitValue):
             self.discounting,
             self.expectile,
         )
-
-        def advantage(after: jax.Array, now: jax.Array) -> jax.Array:
-            return self._value(fixed, after).mean(0) - self._value(fixed, now).mean(0)
-
+        seen = jnp.stack([batch.low_next, batch.low, batch.high_next, batch.high])
+        low_after, low_now, high_after, high_now = self._value(fixed, seen).mean(0)
         levels = Architecture(
             batch.a.shape[-1], self.policy_hidden_layer_sizes, self.representation_size
         )
@@ -142,19 +131,17 @@ class HIQL(ImplicitValue):
         low = apply(levels.actor, params["low_actor"], low_sees)
         high = apply(levels.high_actor, params["high_actor"], batch.high)
         subgoal = apply(self.representation, fixed["representation"], batch.subgoal)
-        a_low = advantage(batch.low_next, batch.low)
-        a_high = advantage(batch.high_next, batch.high)
         return together(
             value=loss_v,
-            low=loss_awr(low, batch.a, a_low, self.low_alpha),
-            high=loss_awr(high, subgoal, a_high, self.high_alpha),
+            low=loss_awr(low, batch.a, low_after - low_now, self.low_alpha),
+            high=loss_awr(high, subgoal, high_after - high_now, self.high_alpha),
         )
 
     def _with_representation(self, params: Params, x: jax.Array) -> jax.Array:
-        """(s, φ(s, g)) `[n, S + k]` from inputs (s, g − o) `[n, S + 3]`."""
+        """(s, φ(s, g)) `[..., S + k]` from inputs (s, g − o) `[..., S + 3]`."""
         phi = apply(self.representation, params["representation"], x)
         return jnp.concatenate([x[..., :-3], phi], axis=-1)
 
     def _value(self, params: Params, x: jax.Array) -> jax.Array:
-        """V(s, φ(s, g)) `[2, n]`; the target has an own V, but no own φ, as in OGBench."""
+        """V(s, φ(s, g)) `[2, ...]`; the target has an own V, but no own φ, as in OGBench."""
         return apply(self.value, params["value"], self._with_representation(params, x))

@@ -78,7 +78,7 @@ def loss_value(
     keeps overestimates small, as double DQN does.
 
     Args:
-      value: inputs `[n, S + 3]` → V `[2, n]`.
+      value: inputs `[..., S + 3]` → V `[2, ...]`.
       target: the same of the target, V̄.
       seen: inputs of s and of s', with the same goal.
       reward_mask: r `[n]`, −1 on the way and 0 at the goal; m `[n]`, 0 at the goal.
@@ -86,9 +86,9 @@ def loss_value(
       expectile: expectile, in (0, 1).
     """
     (now, after), (reward, mask) = seen, reward_mask
-    v_next = target(after)
+    v_next, v_target = jnp.moveaxis(target(jnp.stack([after, now])), 1, 0)
     q = reward + discounting * mask * v_next.min(0)
-    advantage = q - target(now).mean(0)
+    advantage = q - v_target.mean(0)
     v = value(now)
     errors = reward + discounting * mask * v_next - v
     loss = sum(
