@@ -66,7 +66,8 @@ class GCIVL(ImplicitValue):
         away = 1.0 * (value_goal != n)
         steps = jnp.stack([n, n + 1, n, n + 1])
         goals = jnp.stack([value_goal, value_goal, actor_goal, actor_goal])
-        return Batch(*data.seen(sample, steps, goals), data.a[n], -away, away)
+        value, value_next, actor, actor_next = data.seen(sample, steps, goals)
+        return Batch(value, value_next, actor, actor_next, data.a[n], reward=-away, mask=away)
 
     def loss(self, params: Params, target: Params, batch: Batch) -> Loss:
         """L_V + L_π, with A = V(s', g) − V(s, g)."""

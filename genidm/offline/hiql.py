@@ -97,7 +97,9 @@ class HIQL(ImplicitValue):
         away = 1.0 * (value_goal != n)
         steps = jnp.stack([n, n + 1, n, n + 1, n, n, subgoal])
         goals = jnp.stack([value_goal, value_goal, ahead, ahead, high_goal, subgoal, high_goal])
-        return Batch(*data.seen(sample, steps, goals), data.a[n], -away, away)
+        names = ("value", "value_next", "low", "low_next", "high", "subgoal", "high_next")
+        seen = dict(zip(names, data.seen(sample, steps, goals), strict=True))
+        return Batch(**seen, a=data.a[n], reward=-away, mask=away)
 
     def _draw_high(
         self, data: Dataset, key: jax.Array, n: jax.Array, ahead: jax.Array
