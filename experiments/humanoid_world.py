@@ -21,8 +21,9 @@ from genidm.offline.methods import AnyMethod
 from genidm.robots import Humanoid, HumanoidWorld, Robot
 from genidm.runs.cell import make_run
 from genidm.runs.command import run_cli
+from genidm.runs.fitting import InverseDynamicsRun
 from genidm.runs.resolve import Options
-from genidm.runs.run import InverseDynamicsRun, Run
+from genidm.runs.run import Run
 from genidm.store import Stage
 
 METHODS = ("RL", "GE", "LR")
@@ -53,7 +54,7 @@ class ConvertedRun(InverseDynamicsRun):
     def experience_stage(self) -> Stage:
         assert self.source
         config = {"converted_from": self.source.experience_stage.directory.name}
-        return self._stage(f"experience-converted-{self.seed}", config, __name__)
+        return self._stage(f"experience-converted-{self.seed}", config, __name__, __name__)
 
     @property
     def sources(self) -> list[Stage]:

@@ -22,8 +22,8 @@ from genidm.report.runs import Tested
 from genidm.robots import Robot, by_name
 from genidm.runs.cell import announce, make_run, render_run, scenarios_of
 from genidm.runs.command import run_cli
+from genidm.runs.fitting import InverseDynamicsRun
 from genidm.runs.resolve import Options
-from genidm.runs.run import InverseDynamicsRun
 
 KIND = "latent_size"  # of these tests, so that Table 1 does not show them
 

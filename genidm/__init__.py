@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from genidm.paper.fit import fit as fit
     from genidm.paper.generalize import Generalize as Generalize
     from genidm.paper.generalize import generalize as generalize
+    from genidm.paper.held_out import held_out_error as held_out_error
     from genidm.paper.methods import GE as GE
     from genidm.paper.methods import HER_DE as HER_DE
     from genidm.paper.methods import HER_SP as HER_SP
@@ -72,6 +73,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "experience": ("Experience",),
     "paper.generalize": ("generalize", "Generalize"),
     "paper.fit": ("fit", "Fit"),
+    "paper.held_out": ("held_out_error",),
     "controller": ("Controller", "load", "pretrained"),
     "evaluation.scenarios": ("scenarios", "Scenarios"),
     "evaluation.evaluate": ("evaluate", "EvaluationSettings"),

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from genidm import files, symmetry, trees
-from genidm.agents.policy import Policy, described
+from genidm.agents.policy import Policy, bearing, described
 from genidm.checks import WIDEST, check_value, count, layers, one_of, optional, shown
 from genidm.config import to_json
 from genidm.errors import BadInput
 from genidm.offline.policy import GoalPolicy
-from genidm.paper.idm import Architecture
+from genidm.paper.idm import NETWORKS, Architecture
 from genidm.robots import Robot, by_name
+from genidm.symmetry import quarters_to
 
 Frame = Literal["world", "heading"]
 
@@ -38,10 +39,29 @@ def in_frame(
     return robot.observation.rotate(s, -yaw), symmetry.rotate_vector(d, -yaw)
 
 
+def heading(robot: Robot, s: jax.Array) -> jax.Array:
+    """Read the heading `[...]` from s `[..., S]`, radians; 0 for a robot without orientation."""
+    if any(field.yaw for field in robot.observation.fields):
+        return robot.observation.yaw(s)
+    return jnp.zeros(s.shape[:-1], s.dtype)
+
+
+def relative_bearing(robot: Robot, s: jax.Array, d: jax.Array) -> jax.Array:
+    """Compute the bearing `[...]` of d `[..., 3]` from the heading, radians, positive to the left.
+
+    The result is in [−π, π).
+    """
+    return symmetry.wrap(bearing(d) - heading(robot, s))
+
+
 def direction(relative_goal: jax.Array) -> jax.Array:
     """Compute d, the unit vector of o' − o `[..., 3]` (Remark 2); zero if o' = o."""
     length = jnp.linalg.norm(relative_goal, axis=-1, keepdims=True)
     return relative_goal / jnp.maximum(length, 1e-6)
+
+
+def _full_circle() -> np.ndarray:
+    return np.array([-np.pi, np.pi], np.float32)
 
 
 class Controller(flax.struct.PyTreeNode):
@@ -54,6 +74,12 @@ class Controller(flax.struct.PyTreeNode):
       architecture: shape of the models.
       input_frame: frame of the s and d that the models see.
       robot: robot that the models are fitted for.
+      bearings: `[2]`, radians from the heading, positive to the left: 98 % of the d that the
+        models were fitted to lie between these two. (−π, π) if that is not known, or if they lie
+        behind the robot too.
+      clip_bearing: whether d is rotated to the nearer end of `bearings` where it lies outside.
+      nearest_side: whether the side of the body that is nearest to d counts as its front, as in
+        the samples (`pairs.with_nearest_side`).
     """
 
     params: Any
@@ -62,6 +88,9 @@ class Controller(flax.struct.PyTreeNode):
     architecture: Architecture = flax.struct.field(pytree_node=False)
     input_frame: Frame = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
+    bearings: Any = flax.struct.field(default_factory=_full_circle)
+    clip_bearing: bool = flax.struct.field(pytree_node=False, default=False)
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Compute actions `[..., A]` in [−1, 1] from the current state and goal (Remark 1).
@@ -74,8 +103,31 @@ class Controller(flax.struct.PyTreeNode):
           BadInput: the shapes do not fit the robot or each other, or a number is not finite.
         """
         s = self.robot.check_inputs(s, relative_goal)
-        s, d = in_frame(self.robot, self.input_frame, s, direction(relative_goal))
+        d = direction(relative_goal)
+        if not self.nearest_side:
+            return self._act(s, d)
+        quarters = quarters_to(bearing(d), heading(self.robot, s))
+        action = self._act(self.robot.observation.turn_body_by(s, quarters), d)
+        return self.robot.action.turn_body_by(action, -quarters)
+
+    def _act(self, s: jax.Array, d: jax.Array) -> jax.Array:
+        if self.clip_bearing:
+            d = self.inside(s, d)
+        s, d = in_frame(self.robot, self.input_frame, s, d)
         return jnp.clip(self.action(self.latent(s, d)), -1.0, 1.0)
+
+    def inside(self, s: jax.Array, d: jax.Array) -> jax.Array:
+        """Rotate d `[..., 3]` about the vertical to a bearing between `bearings`.
+
+        A bearing b in [−π, π) becomes clip(b, low, high): a d to the left stays to the left if the
+        models have seen any d there.
+
+        Args:
+          s: states `[..., S]`.
+          d: directions, or relative goals, in the world frame.
+        """
+        angle = relative_bearing(self.robot, s, d)
+        return symmetry.rotate_vector(d, jnp.clip(angle, *self.bearings) - angle)
 
     def normalize(self, s: jax.Array) -> jax.Array:
         """Normalise states by the training statistics, and clip them to ±10."""
@@ -96,6 +148,7 @@ class Controller(flax.struct.PyTreeNode):
             "params": self.architecture.init(key, size),
             "mean": jnp.zeros(size, jnp.float32),
             "std": jnp.ones(size, jnp.float32),
+            "bearings": jnp.asarray(_full_circle()),
         }
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
@@ -104,12 +157,11 @@ class Controller(flax.struct.PyTreeNode):
         Raises:
           BadInput: the path exists, and `overwrite` is not set.
         """
-        leaves = jax.tree.map(
-            np.asarray, {"params": self.params, "mean": self.mean, "std": self.std}
-        )
-        meta = (
-            described(self.robot) | {"input_frame": self.input_frame} | to_json(self.architecture)
-        )
+        names = ("params", "mean", "std", "bearings")
+        leaves = jax.tree.map(np.asarray, {name: getattr(self, name) for name in names})
+        meta = described(self.robot) | to_json(self.architecture)
+        meta |= {"input_frame": self.input_frame, "clip_bearing": self.clip_bearing}
+        meta |= {"nearest_side": self.nearest_side}
         files.save_arrays(path, leaves, meta, overwrite)
 
     @classmethod
@@ -119,16 +171,27 @@ class Controller(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the models is invalid.
         """
+        # Older files do not have these.
+        meta = dict[str, Any](network="mlp", clip_bearing=False, nearest_side=False) | meta
         for name, allowed in (
             ("action_size", count(robot.action.size, robot.action.size)),
             ("idm", layers), ("lfm", layers), ("latent_size", optional(count(1, WIDEST))),
-            ("input_frame", one_of(get_args(Frame))),
+            ("input_frame", one_of(get_args(Frame))), ("network", one_of(NETWORKS)),
+            ("clip_bearing", one_of((False, True))), ("nearest_side", one_of((False, True))),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         architecture = Architecture(
-            meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"]
+            meta["action_size"], tuple(meta["idm"]), tuple(meta["lfm"]), meta["latent_size"],
+            meta["network"],
+        )  # fmt: skip
+        return cls(
+            **tree,
+            architecture=architecture,
+            input_frame=meta["input_frame"],
+            robot=robot,
+            clip_bearing=meta["clip_bearing"],
+            nearest_side=meta["nearest_side"],
         )
-        return cls(**tree, architecture=architecture, input_frame=meta["input_frame"], robot=robot)
 
 
 # Field that a kind of controller alone has in its metadata → the kind.
@@ -178,7 +241,7 @@ def load(
             "(METHOD-SEED-…)"
         )
     tree, meta = files.load_arrays(place)
-    if tree.keys() != {"params", "mean", "std"} or not isinstance(meta, dict):
+    if tree.keys() - {"bearings"} != {"params", "mean", "std"} or not isinstance(meta, dict):
         raise BadInput(f"{path} holds no controller")
     made_for = meta.get("robot")
     robot = robot or by_name(made_for if isinstance(made_for, str) else "", engine)
@@ -193,7 +256,7 @@ def load(
         wanted = jax.eval_shape(made.fresh, jax.random.key(0))
     except (BadInput, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise BadInput(f"{path} holds no controller: {shown(error)}") from None
-    _as_wanted(path, {"params": made.params, "mean": made.mean, "std": made.std}, wanted)
+    _as_wanted(path, {name: getattr(made, name) for name in wanted}, wanted)
     return made
 
 

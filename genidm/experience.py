@@ -20,6 +20,8 @@ from genidm.tasks import Transition
 
 # Metres; at larger distances, float32 rounds a position by more than 0.01 mm.
 FAR = 100.0
+# Fields that a log may lack.
+OPTIONAL = {"physics", "intended", "forward"}
 
 
 class Experience(flax.struct.PyTreeNode):
@@ -35,6 +37,9 @@ class Experience(flax.struct.PyTreeNode):
       valid: `[T, B]` bool, False where the physics diverged in the step.
       physics: tree `[T, B, ...]`, physics before the step; None for a log without physics,
         which can be rotated (`Generalize(mode="rotate")`), but not replayed.
+      intended: `[T, B, A]`, the action that the agent chose before it added exploration; None for
+        a log without it.
+      forward: `[T, B]`, radians, direction in the world that the agent saw as +x; None: always +x.
     """
 
     s: Any
@@ -45,20 +50,29 @@ class Experience(flax.struct.PyTreeNode):
     last: Any
     valid: Any
     physics: Any = None
+    intended: Any = None
+    forward: Any = None
 
     @property
     def interactions(self) -> int:
         """Number of recorded transitions."""
         return self.first.shape[0] * self.first.shape[1]
 
-    def first_fraction(self, fraction: float) -> Experience:
-        """The earliest `fraction` of the record, in (0, 1]."""
-        steps = max(1, round(self.first.shape[0] * fraction))
-        return jax.tree.map(lambda x: x[:steps], self)
+    def part(self, fraction: float, skip: float = 0.0) -> Experience:
+        """A part of the record in time.
+
+        Args:
+          fraction: length of the part, as a fraction of the record, in (0, 1].
+          skip: fraction of the record before the part, in [0, 1 − fraction].
+        """
+        steps = self.first.shape[0]
+        begin, length = round(steps * skip), max(1, round(steps * fraction))
+        begin = min(begin, steps - length)
+        return jax.tree.map(lambda x: x[begin : begin + length], self)
 
     def first_half(self) -> Experience:
         """The first half of the record, from which GE and LR learn (A.1.2)."""
-        return self.first_fraction(0.5)
+        return self.part(0.5)
 
     def save(self, path: Path | str, overwrite: bool = False) -> None:
         """Write the record as a directory of arrays, without pickle.
@@ -175,8 +189,8 @@ def _as_floats(made: Experience) -> Experience:
     """Convert integers and half floats to float64, because their arithmetic is not exact enough."""
     wide = {
         name: x.astype(np.float64)
-        for name in ("s", "o", "o_next", "a")
-        if (x := getattr(made, name)).dtype not in (np.float32, np.float64)
+        for name in ("s", "o", "o_next", "a", "intended", "forward")
+        if (x := getattr(made, name)) is not None and x.dtype not in (np.float32, np.float64)
     }
     return made.replace(**wide)
 
@@ -186,7 +200,7 @@ def _lists_as_arrays(experience: Experience) -> Experience:
     arrays = {
         f.name: np.asarray(x) if isinstance(x, list | tuple) else x
         for f in dataclasses.fields(Experience)
-        if (x := getattr(experience, f.name)) is not None or f.name == "physics"
+        if (x := getattr(experience, f.name)) is not None or f.name in OPTIONAL
     }
     return experience.replace(**arrays)
 
@@ -211,9 +225,15 @@ def _check_shapes(made: Experience, robot: Robot) -> None:
         raise BadInput(f"experience: first has shape {steps_lanes}, expected [steps, lanes]")
     if 0 in steps_lanes:
         raise BadInput(f"experience: the record is empty: first has shape {steps_lanes}")
-    sizes = {"s": (robot.observation.size,), "o": (3,), "o_next": (3,), "a": (robot.action.size,)}
-    for name, size in (sizes | {"last": (), "valid": ()}).items():
-        shape = getattr(made, name).shape
+    state, action = (robot.observation.size,), (robot.action.size,)
+    sizes: dict[str, tuple[int, ...]] = {
+        "s": state, "o": (3,), "o_next": (3,), "a": action, "last": (), "valid": (),
+        "intended": action, "forward": (),
+    }  # fmt: skip
+    for name, size in sizes.items():
+        if (field := getattr(made, name)) is None and name in OPTIONAL:
+            continue
+        shape = np.shape(field)
         if shape != (*steps_lanes, *size):
             expected = (*steps_lanes, *size)
             raise BadInput(f"experience: {name} has shape {shape}, expected {expected}")
@@ -229,7 +249,7 @@ def _check_shapes(made: Experience, robot: Robot) -> None:
 
 
 def _check_finite(clean: Experience) -> None:
-    for name in ("s", "o", "o_next", "a", "physics"):
+    for name in ("s", "o", "o_next", "a", *sorted(OPTIONAL)):
         for x in jax.tree.leaves(getattr(clean, name)):
             if not np.isfinite(x).all():
                 t, lane = np.argwhere(~np.isfinite(x))[0][:2]
@@ -318,8 +338,13 @@ def _check_orientation(clean: Experience, robot: Robot) -> None:
             raise BadInput(f"experience: {field.name!r} fits the robot's motion only {words} (s)")
 
 
-def record(step: Transition) -> Experience:
-    """Convert one transition of B lanes to Experience, arrays `[B, ...]`."""
+def record(step: Transition, intended: jax.Array | None = None) -> Experience:
+    """Convert one transition of B lanes to Experience, arrays `[B, ...]`.
+
+    Args:
+      step: the transition.
+      intended: `[B, A]`, the actions before exploration.
+    """
     return Experience(
         s=step.before.observation,
         o=step.before.position,
@@ -329,6 +354,8 @@ def record(step: Transition) -> Experience:
         last=step.last,
         valid=~step.after.diverged,
         physics=step.before.physics,
+        intended=intended,
+        forward=step.view.forward,
     )
 
 
@@ -344,7 +371,7 @@ def load(path: Path | str, robot: Robot) -> Experience:
       BadInput: the directory is corrupt, or the record does not fit the robot.
     """
     tree, _ = files.load_arrays(path)
-    if tree.keys() | {"physics"} != {f.name for f in dataclasses.fields(Experience)}:
+    if tree.keys() | OPTIONAL != {f.name for f in dataclasses.fields(Experience)}:
         raise BadInput(f"{path} does not hold an experience")
     experience = Experience(**tree)
     _check_shapes(experience, robot)

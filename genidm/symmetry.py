@@ -3,7 +3,8 @@
 All data of a robot (its state s, its physics, its actions) is a tuple of named fields, a
 `Layout`. Each field defines its transformation under a rotation of the world by a yaw about
 the vertical (equivalence modulo orientation, Def. 3) and under the reflection in the plane
-y = 0. All functions are pure and act on arrays `[..., n]`.
+y = 0; and, for a body with four equal sides, under a quarter turn of the body's own axes. All
+functions are pure and act on arrays `[..., n]`.
 
 The frame is right-handed with z up; angles are in radians; quaternions are (w, x, y, z).
 """
@@ -11,6 +12,7 @@ The frame is right-handed with z up; angles are in radians; quaternions are (w, 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -64,6 +66,17 @@ def euler_of(q: Array) -> Array:
     return jnp.stack([roll, pitch, yaw_of(q)], axis=-1)
 
 
+def turn_axes(v: Array) -> Array:
+    """Coordinates of vectors `[..., 3]` after the axes turn by +90° about z: (y, −x, z)."""
+    return jnp.stack([v[..., 1], -v[..., 0], v[..., 2]], axis=-1)
+
+
+def turn_quaternion(q: Array) -> Array:
+    """Orientations `[..., 4]` after the body's axes turn by +90° about its own z axis."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return canonical_quaternion(jnp.stack([w - z, x + y, y - x, z + w], axis=-1) * math.sqrt(0.5))
+
+
 def horizontal_norm(v: Array) -> Array:
     """Length `[...]` of the horizontal part of vectors `[..., 3]`."""
     return jnp.hypot(v[..., 0], v[..., 1])
@@ -89,6 +102,8 @@ class Field:
       canonical: x [..., size] → the representative of equivalent values (w ≥ 0 of q and −q).
       otherwise: for fields with a heading: x [..., size] → x converted from another unit or
         order (degrees; w last), or None if x cannot be in it; and a phrase for messages.
+      turn_body: x [..., size] → x after the body's axes turn by +90° about its z axis, so that its
+        left becomes its front; None if the body has no such symmetry.
     """
 
     name: str
@@ -101,6 +116,7 @@ class Field:
     invalid: Callable[[np.ndarray], str | None] | None = None
     canonical: Callable[[Array], Array] | None = None
     otherwise: tuple[Callable[[np.ndarray], np.ndarray | None], str] | None = None
+    turn_body: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         if why := printable(self.name):
@@ -122,28 +138,35 @@ def _check_involution(name: str, permutation: Sequence[int]) -> None:
         raise BadInput(f"{name!r}: permutation must be its own inverse, not {order}")
 
 
+def _same(x: Array) -> Array:
+    return x
+
+
 def _keep(x: Array, yaw: Array) -> Array:
     return x
 
 
 def invariant(name: str, size: int = 1, unit: str = "1") -> Field:
     """Numbers that do not change under rotation or reflection (a height)."""
-    return Field(name, size, "invariant", unit, _keep, lambda x: x)
+    return Field(name, size, "invariant", unit, _keep, _same, turn_body=_same)
 
 
 def vector(name: str, unit: str = "m") -> Field:
     """A vector in the world frame (a position, a linear velocity, a force)."""
-    return Field(name, 3, "vector", unit, rotate_vector, _signed([1, -1, 1]))
+    mirror = _signed([1, -1, 1])
+    return Field(name, 3, "vector", unit, rotate_vector, mirror, turn_body=_same)
 
 
 def pseudovector(name: str, unit: str = "rad/s") -> Field:
     """A pseudovector in the world frame (an angular velocity)."""
-    return Field(name, 3, "pseudovector", unit, rotate_vector, _signed([-1, 1, -1]))
+    mirror = _signed([-1, 1, -1])
+    return Field(name, 3, "pseudovector", unit, rotate_vector, mirror, turn_body=_same)
 
 
 def body_pseudovector(name: str, unit: str = "rad/s") -> Field:
     """A pseudovector in the body's own frame (MuJoCo's angular velocity of a free joint)."""
-    return Field(name, 3, "pseudovector in the body frame", unit, _keep, _signed([-1, 1, -1]))
+    kind, mirror = "pseudovector in the body frame", _signed([-1, 1, -1])
+    return Field(name, 3, kind, unit, _keep, mirror, turn_body=turn_axes)
 
 
 def quaternion(name: str) -> Field:
@@ -164,6 +187,7 @@ def quaternion(name: str) -> Field:
         _invalid_quaternion,
         canonical_quaternion,
         w_last,
+        turn_quaternion,
     )
 
 
@@ -221,7 +245,13 @@ def _invalid_euler(angles: np.ndarray) -> str | None:
     return None
 
 
-def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: str) -> Field:
+def joints(
+    name: str,
+    permutation: Sequence[int],
+    signs: Sequence[float],
+    unit: str,
+    quarter: tuple[Sequence[int], Sequence[float]] | None = None,
+) -> Field:
     """One number per joint: invariant to rotation; a reflection moves it to the mirrored joint.
 
     Args:
@@ -229,6 +259,8 @@ def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: 
       permutation: index of the mirror image of each joint.
       signs: sign (1 or −1) that a reflection gives to each joint's number.
       unit: unit of each number.
+      quarter: index of the joint that each joint becomes by a quarter turn of the body's axes,
+        and signs; None if the body has no such symmetry.
 
     Raises:
       BadInput: `permutation` is not its own inverse, or `signs` has another length.
@@ -237,15 +269,18 @@ def joints(name: str, permutation: Sequence[int], signs: Sequence[float], unit: 
     if len(signs) != len(permutation):
         raise BadInput(f"{name!r} has {len(permutation)} joints, but {len(signs)} signs")
     mirror = _signed(signs, permutation)
-    return Field(name, len(permutation), "joints", unit, _keep, mirror)
+    turn = None if quarter is None else _signed(quarter[1], quarter[0])
+    return Field(name, len(permutation), "joints", unit, _keep, mirror, turn_body=turn)
 
 
-def wrenches(name: str, permutation: Sequence[int]) -> Field:
+def wrenches(name: str, permutation: Sequence[int], quarter: Sequence[int] | None = None) -> Field:
     """Torque (3) and force (3) on each of several bodies, in the world frame.
 
     Args:
       name: what the numbers are.
       permutation: index of the mirror image of each body.
+      quarter: index of the body that each body becomes by a quarter turn of the body's axes; None
+        if there is no such symmetry.
 
     Raises:
       BadInput: `permutation` is not its own inverse.
@@ -261,7 +296,11 @@ def wrenches(name: str, permutation: Sequence[int]) -> Field:
     def mirror(x: Array) -> Array:
         return (x.reshape(*x.shape[:-1], count, 6)[..., order, :] * signs).reshape(x.shape)
 
-    return Field(name, 6 * count, "wrenches", "N·m, N", rotate, mirror)
+    def turn(x: Array) -> Array:
+        return x.reshape(*x.shape[:-1], count, 6)[..., np.asarray(quarter), :].reshape(x.shape)
+
+    kind, unit, turn_body = "wrenches", "N·m, N", None if quarter is None else turn
+    return Field(name, 6 * count, kind, unit, rotate, mirror, turn_body=turn_body)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,6 +367,30 @@ class Layout:
         parts = zip(self.fields, self._split(x), strict=True)
         return jnp.concatenate([f.mirror(part) for f, part in parts], axis=-1)
 
+    @property
+    def can_turn(self) -> bool:
+        """Whether every field has a quarter turn of the body."""
+        return all(f.turn_body for f in self.fields)
+
+    def turn_body(self, x: Array) -> Array:
+        """Turn the body's axes by +90° in x `[..., n]`: the same motion of a body with four sides.
+
+        Raises:
+          ValueError: a field has no quarter turn.
+        """
+        if not self.can_turn:
+            raise ValueError("this body is not its own image after a quarter turn")
+        parts = zip(self.fields, self._split(x), strict=True)
+        return jnp.concatenate([f.turn_body(p) for f, p in parts if f.turn_body], axis=-1)
+
+    def turn_body_by(self, x: Array, quarters: Array) -> Array:
+        """Turn the body's axes in x `[..., n]` by `quarters [...]` (integers) quarter turns."""
+        turned = [x]
+        for _ in range(3):
+            turned.append(self.turn_body(turned[-1]))
+        which = jnp.mod(quarters, 4)[..., None]
+        return jnp.select([which == n for n in range(4)], turned)
+
     def yaw(self, x: Array) -> Array:
         """Read the heading `[...]` from x `[..., n]`, radians.
 
@@ -350,3 +413,11 @@ class Layout:
             rows.append(f"| {start}–{start + f.size - 1} | {f.name} | {f.unit} | {f.kind} |")
             start += f.size
         return "\n".join(rows)
+
+
+def quarters_to(angle: Array, heading: Array) -> Array:
+    """Quarter turns `[...]` of the body's axes after which its front is nearest to `angle [...]`.
+
+    Both angles are in radians, in the world; afterwards the heading is within ±45° of `angle`.
+    """
+    return jnp.round(wrap(angle - heading) / (jnp.pi / 2)).astype(jnp.int32)

@@ -15,9 +15,46 @@ import jax
 import jax.numpy as jnp
 
 from genidm.checks import check, count, number, positive
+from genidm.errors import BadInput
 from genidm.paper.protocol import TARGET_BEARING
 from genidm.robots.base import Robot, State
-from genidm.symmetry import horizontal_norm
+from genidm.symmetry import horizontal_norm, quarters_to, vector, wrap
+
+RELATIVE_GOAL = vector("relative goal")
+
+
+class View(flax.struct.PyTreeNode):
+    """How a policy sees robots `[B]`, and what its actions mean.
+
+    Attributes:
+      forward: `[B]`, radians, the direction in the world that the policy sees as +x; None: +x.
+      nearest_side: whether the policy sees the side of the body that is nearest to +x as its front
+        (for a body with four equal sides).
+    """
+
+    forward: Any = None
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
+
+    def state(self, robot: Robot, robots: State) -> jax.Array:
+        """s `[B, S]` as the policy sees it."""
+        s = robots.observation
+        if self.forward is not None:
+            s = robot.observation.rotate(s, -self.forward)
+        if self.nearest_side:
+            s = robot.observation.turn_body_by(s, self._quarters(robots))
+        return s
+
+    def seen_action(self, robot: Robot, robots: State, a: jax.Array) -> jax.Array:
+        """The policy's action `[B, A]` for the robot's action `a [B, A]`."""
+        return robot.action.turn_body_by(a, self._quarters(robots)) if self.nearest_side else a
+
+    def robot_action(self, robot: Robot, robots: State, a: jax.Array) -> jax.Array:
+        """The robot's action `[B, A]` for the policy's action `a [B, A]`."""
+        return robot.action.turn_body_by(a, -self._quarters(robots)) if self.nearest_side else a
+
+    def _quarters(self, robots: State) -> jax.Array:
+        forward = jnp.zeros_like(robots.heading) if self.forward is None else self.forward
+        return quarters_to(forward, robots.heading)
 
 
 class EnvState(flax.struct.PyTreeNode):
@@ -28,17 +65,23 @@ class EnvState(flax.struct.PyTreeNode):
       episode_step: `[B]` int32, steps since the episode began.
       keys: `[B]`, one random key per lane, so that results do not depend on sharding.
       goal: `[B, 3]`, metres, world frame; None if the task has no goals.
+      view: how the policy sees the robots.
     """
 
     robots: State
     episode_step: jax.Array
     keys: jax.Array
     goal: Any = None
+    view: View = View()
 
     @property
     def relative_goal(self) -> Any:
         """Vectors `[B, 3]` from robots to goals, metres; None if the task has no goals."""
         return None if self.goal is None else self.goal - self.robots.position
+
+    def inputs(self, robot: Robot) -> jax.Array:
+        """The input `[B, I]` of a policy in this state."""
+        return inputs(self.view.state(robot, self.robots), self.relative_goal)
 
 
 class Outcome(NamedTuple):
@@ -64,6 +107,7 @@ class Transition(flax.struct.PyTreeNode):
       action: a `[B, A]`.
       after: State `[B]` after the step.
       goal: `[B, 3]`, metres, world frame; None if the task has no goals.
+      view: how the policy saw the robots before the step.
       reward: `[B]`.
       absorbing_reward: `[B]`, see `Outcome`.
       episode_step: `[B]` int32, steps of the episode before this step.
@@ -75,6 +119,7 @@ class Transition(flax.struct.PyTreeNode):
     action: jax.Array
     after: State
     goal: Any
+    view: View
     reward: jax.Array
     absorbing_reward: jax.Array
     episode_step: jax.Array
@@ -86,15 +131,22 @@ class Transition(flax.struct.PyTreeNode):
         """`[B]` bool, the first step of an episode."""
         return self.episode_step == 0
 
+    def inputs(self, robot: Robot) -> jax.Array:
+        """The input `[B, I]` of the policy before the step."""
+        goal = None if self.goal is None else self.goal - self.before.position
+        return inputs(self.view.state(robot, self.before), goal)
+
 
 class Task(Protocol):
-    """The interface of a task; tasks are frozen dataclasses of settings.
+    """The interface of a task; tasks are frozen dataclasses of settings, and subclasses of this.
 
     Attributes:
       goal_conditioned: whether the task has goals.
+      nearest_side: see `View`.
     """
 
     goal_conditioned: ClassVar[bool]
+    nearest_side: bool = False
 
     def start(self, robot: Robot, keys: jax.Array) -> EnvState:
         """EnvState `[B]` at the start of new episodes, from keys `[B]`."""
@@ -107,41 +159,94 @@ class Task(Protocol):
     def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """Metrics of a step for the learning curves, `[B]` each."""
 
+    def draw(self, key: jax.Array) -> Any:
+        """Draw the random numbers of one step of one lane; None if the task needs none."""
+        return None
+
+    def advance(self, lanes: EnvState, numbers: Any) -> EnvState:
+        """Change the task of `lanes [B]` after a step, with the numbers that `draw` drew for it."""
+        return lanes
+
 
 @dataclasses.dataclass(frozen=True)
-class WalkForward:
-    """The task to walk towards +x without a fall (A.1.1).
+class WalkForward(Task):
+    """The task to walk towards +x without a fall (A.1.1), optionally in a turning world.
+
+    In a turning world, the direction that the policy sees as +x, and is rewarded for, changes at
+    random times. So the agent learns to turn while it walks. It still has one reward, and no goal.
+    The robot and its record stay in the world frame: a turn interrupts neither.
 
     Attributes:
       episode_steps: time limit of an episode, in steps.
       start_yaw: radians; the initial yaw is uniform in ± this value. 0, as in the paper: every
         episode starts facing +x.
+      turn_rate: probability per step that the world turns. 0, as in the paper: it never turns.
+      turn_spread: radians; after a turn, +x is uniform in ± this value about the robot's heading.
+      nearest_side: the policy sees the side of the body that is nearest to +x as its front, so
+        that it need not turn by more than 45°. Only for a body with four equal sides (the Ant).
     """
 
     episode_steps: int = 1000
     start_yaw: float = 0.0
+    turn_rate: float = 0.0
+    turn_spread: float = 1.0
+    nearest_side: bool = False
     goal_conditioned: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check(self, episode_steps=count(), start_yaw=number(0))
+        angle = number(0)
+        check(self, episode_steps=count(), start_yaw=angle, turn_spread=angle)
+        check(self, turn_rate=number(0, 1))
 
     def start(self, robot: Robot, keys: jax.Array) -> EnvState:
+        if self.nearest_side and not robot.can_turn_body:
+            raise BadInput(f"nearest_side needs a body with four equal sides, not the {robot.name}")
         robots, streams = _fresh(robot, keys, self.start_yaw)
-        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams)
+        forward = jnp.zeros_like(robots.heading) if self.turn_rate else None
+        view = View(forward, self.nearest_side)
+        return EnvState(robots, jnp.zeros(keys.shape, jnp.int32), streams, view=view)
+
+    def draw(self, key: jax.Array) -> Any:
+        """Two uniform numbers, in [0, 1) for when and in [−1, 1) for how far the world turns."""
+        if not self.turn_rate:
+            return None
+        when, far = jax.random.split(key)
+        return (
+            jax.random.uniform(when, (), jnp.float32),
+            jax.random.uniform(far, (), jnp.float32, minval=-1.0),
+        )
+
+    def advance(self, lanes: EnvState, numbers: Any) -> EnvState:
+        """Turn the world of some lanes."""
+        if numbers is None:
+            return lanes
+        when, far = numbers
+        turned = wrap(lanes.robots.heading + self.turn_spread * far)
+        forward = jnp.where(when < self.turn_rate, turned, lanes.view.forward)
+        return lanes.replace(view=lanes.view.replace(forward=forward))
 
     def transition(
         self, robot: Robot, lanes: EnvState, action: jax.Array, after: State
     ) -> Transition:
-        forward = (after.position[:, 0] - lanes.robots.position[:, 0]) / robot.dt
+        speed = _forward_speed(robot, lanes.robots, after, lanes.view.forward)
         terminal = after.fallen | after.diverged
-        reward = forward + robot.healthy_reward * ~terminal - robot.cost(after, action)
+        reward = speed + robot.healthy_reward * ~terminal - robot.cost(after, action)
         outcome = Outcome(reward, terminal, jnp.zeros_like(reward))
         return to_transition(lanes, action, after, outcome, self.episode_steps)
 
     def metrics(self, robot: Robot, step: Transition) -> dict[str, jax.Array]:
         """Forward speed in m/s, reward, falls, divergences."""
-        forward = step.after.position[:, 0] - step.before.position[:, 0]
-        return {"speed": forward / robot.dt} | _common(step)
+        speed = _forward_speed(robot, step.before, step.after, step.view.forward)
+        return {"speed": speed} | _common(step)
+
+
+def _forward_speed(robot: Robot, before: State, after: State, forward: Any) -> jax.Array:
+    """Speed `[B]` in the direction `forward [B]` (None: +x), m/s."""
+    way = after.position - before.position
+    ahead = way[:, 0]
+    if forward is not None:
+        ahead = way[:, 0] * jnp.cos(forward) + way[:, 1] * jnp.sin(forward)
+    return ahead / robot.dt
 
 
 class GoalStep(NamedTuple):
@@ -206,7 +311,7 @@ class Dense:
 
 
 @dataclasses.dataclass(frozen=True)
-class GoToGoal:
+class GoToGoal(Task):
     """The task to walk to a goal; every episode has a new start, heading and goal.
 
     Goals have the distribution of the paper's test (A.1.3), so that the baselines train on
@@ -312,6 +417,7 @@ def to_transition(
         action=action,
         after=after,
         goal=lanes.goal,
+        view=lanes.view,
         reward=outcome.reward,
         absorbing_reward=outcome.absorbing_reward,
         episode_step=lanes.episode_step,
@@ -331,6 +437,13 @@ def _common(step: Transition) -> dict[str, jax.Array]:
 def inputs(s: jax.Array, relative_goal: Any) -> jax.Array:
     """The input of a policy: s `[..., S]`, or (s, g − o) `[..., S + 3]` with a goal."""
     return s if relative_goal is None else jnp.concatenate([s, relative_goal], axis=-1)
+
+
+def mirror_inputs(robot: Robot, x: jax.Array) -> jax.Array:
+    """The input `[..., I]` of a policy after the reflection y → −y."""
+    s, relative_goal = jnp.split(x, [robot.observation.size], axis=-1)
+    goal = RELATIVE_GOAL.mirror(relative_goal) if relative_goal.shape[-1] else None
+    return inputs(robot.observation.mirror(s), goal)
 
 
 def input_size(robot: Robot, task: Task) -> int:

@@ -84,7 +84,8 @@ def assert_commutes(
       change: (layout, x) → x as the layout transforms it.
     """
     actions, after, contact = episode
-    wrenches = Layout((symmetry.wrenches("contact", robot.mirror.bodies),))
+    quarter = robot.quarter_turn.bodies if robot.quarter_turn else None
+    wrenches = Layout((symmetry.wrenches("contact", robot.mirror.bodies, quarter),))
     with jax.enable_x64(True):
 
         def on(layout: Layout, x: np.ndarray) -> np.ndarray:

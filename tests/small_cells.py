@@ -19,6 +19,7 @@ from genidm.evaluation.scenarios import Scenarios, scenarios
 from genidm.paper import methods
 from genidm.paper.methods import InverseDynamics, Method
 from genidm.runs import command as command_module
+from genidm.runs import fitting, recording
 from genidm.runs import run as run_module
 from genidm.runs.cell import make_run, run_method
 from genidm.runs.resolve import Options
@@ -40,7 +41,7 @@ def options(out: Path, **changes) -> Options:
     return dataclasses.replace(Options(scale="0.5", run_dir=out, episodes=2, test=TEST), **changes)
 
 
-STAGES = ("collect", "replay", "fit", "run")
+STAGES = {"collect": recording, "replay": fitting, "fit": fitting, "run": run_module}
 
 
 @contextlib.contextmanager
@@ -56,8 +57,8 @@ def counted() -> Iterator[Counter]:
         return counted
 
     with pytest.MonkeyPatch.context() as m:
-        for name in STAGES:
-            m.setattr(run_module, name, counting(name, getattr(run_module, name)))
+        for name, module in STAGES.items():
+            m.setattr(module, name, counting(name, getattr(module, name)))
         yield calls
 
 

@@ -16,9 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from genidm import symmetry
 from genidm.engines import Physics
+from genidm.errors import BadInput
 from genidm.robots import Ant, State
-from genidm.robots.mujoco import mirror_of
-from genidm.tasks import EnvState, Transition, WalkForward
+from genidm.robots.humanoid import Humanoid
+from genidm.robots.mujoco import REFLECTION, image_of
+from genidm.tasks import EnvState, Transition, View, WalkForward
 
 LANES = 32
 
@@ -141,6 +143,48 @@ def test_mirror_commutes_with_physics(ant: Ant, starts: Physics, episode: tuple[
     assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.mirror(x))
 
 
+def test_quarter_turn_of_the_body_commutes_with_physics(
+    ant: Ant, starts: Physics, episode: tuple[Any, ...]
+) -> None:
+    assert_commutes(ant, observed_in_c, starts, episode, lambda layout, x: layout.turn_body(x))
+
+
+def test_a_policy_sees_the_nearest_side_as_front(ant: Ant) -> None:
+    """Robots that differ by quarter turns of the body look the same, and act the same."""
+    states = ant.reset(jnp.repeat(keys(5)[:1], 4), jnp.full(4, 0.2))
+    bodies = [states.physics]
+    for _ in range(3):
+        bodies.append(ant.turn_body_physics(bodies[-1]))
+    physics = jax.tree.map(lambda *x: jnp.stack([y[n] for n, y in enumerate(x)]), *bodies)
+    robots = ant.set_state(physics, jnp.zeros(4))
+    view = View(jnp.full(4, 0.5), nearest_side=True)
+    seen = view.state(ant, robots)
+    assert_close(seen, np.broadcast_to(seen[0], seen.shape), atol=1e-5)
+    assert_close(seen[0], ant.observation.rotate(robots.observation[:1], -0.5)[0], atol=1e-5)
+    a = jnp.linspace(-1, 1, 8)
+    acted = view.robot_action(ant, robots, jnp.broadcast_to(a, (4, 8)))
+    for n in range(4):
+        turned = acted[n]
+        for _ in range((4 - n) % 4):
+            turned = ant.action.turn_body(turned)
+        assert_close(turned, a, atol=1e-6)
+    assert_close(view.seen_action(ant, robots, acted), np.broadcast_to(a, (4, 8)), atol=1e-6)
+
+
+def test_only_a_body_with_four_sides_has_a_nearest_one() -> None:
+    with pytest.raises(BadInput, match="four equal sides, not the humanoid"):
+        WalkForward(nearest_side=True).start(Humanoid(engine="mujoco"), keys(0))
+
+
+def test_quarter_turn_is_read_off_the_model(ant: Ant) -> None:
+    """Each leg becomes the next; the ankles' axes differ, so that two of them turn their sign."""
+    assert ant.quarter_turn is not None
+    assert ant.quarter_turn.hinges == [2, 3, 4, 5, 6, 7, 0, 1]
+    assert ant.quarter_turn.signs == [1, -1, 1, 1, 1, -1, 1, 1]
+    assert Humanoid(engine="mujoco").quarter_turn is None
+    assert not Humanoid(engine="mujoco").can_turn_body
+
+
 def test_mirror_is_read_off_the_model(ant: Ant) -> None:
     """Legs 1↔4 and 2↔3: hips turn their sign, ankles (whose axes differ) keep it."""
     assert ant.mirror.hinges == [6, 7, 4, 5, 2, 3, 0, 1]
@@ -154,8 +198,8 @@ def test_a_lopsided_model_is_refused() -> None:
     body = spec.worldbody.add_body(pos=[0, 1, 1])
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
-    with pytest.raises(ValueError, match="its own mirror image"):
-        mirror_of(spec.compile())
+    with pytest.raises(ValueError, match="its own image"):
+        image_of(spec.compile(), REFLECTION)
 
 
 # ── (c) resets, placing, divergence, actions ────────────────────────────────────────────────

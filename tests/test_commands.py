@@ -40,7 +40,11 @@ pytestmark = pytest.mark.usefixtures("one_bank")
 
 def test_the_method_with_paper_settings_is_the_papers() -> None:
     this = make_run(Point(), LR, Options(paper_settings=True)).method
-    assert this == paper_settings(LR) and this.name == "LR paper" and this.goal_horizon == 1
+    assert (
+        this == paper_settings(LR, Point.name)
+        and this.name == "LR paper"
+        and this.goal_horizon == 1
+    )
     kept = (
         this.generalize.mode,
         this.fit.latent_loss_weight,

@@ -49,6 +49,7 @@ offline.gcbc offline.implicit offline.crl
 offline.gcivl offline.hiql
 controller
 paper.fit
+paper.held_out
 evaluation.scenarios
 evaluation.evaluator
 evaluation.evaluate
@@ -56,12 +57,14 @@ evaluation.invariance evaluation.waypoints
 evaluation.stats evaluation.sanity
 report.rows
 report.table report.drawing
-report.figures report.waypoint_figure
+report.figures report.waypoint_figure report.held_out_figure
 report
 paper.methods offline.train
 offline.methods
 runs.scale
 runs.resolve runs.run
+runs.recording
+runs.fitting runs.policies
 runs.offline
 report.runs
 report.shown

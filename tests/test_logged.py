@@ -86,7 +86,7 @@ def test_a_goal_horizon_longer_than_all_episodes_is_said() -> None:
 def test_a_record_is_checked_once_and_again_when_it_changes() -> None:
     robot, prepared = Mine(), log().prepared(Mine())
     assert prepared.prepared(robot) is prepared
-    half = prepared.first_fraction(0.5)
+    half = prepared.part(0.5)
     assert half.prepared(robot) is half
     with pytest.raises(BadInput, match="a lies outside"):
         prepared.replace(a=2 + prepared.a).prepared(robot)

@@ -29,7 +29,7 @@ from genidm.agents import unroll
 from genidm.agents.collect import collect
 from genidm.agents.ddpg import DDPG
 from genidm.agents.her import HER
-from genidm.agents.off_policy import OffPolicy
+from genidm.agents.off_policy import OffPolicy, half_mirrored
 from genidm.agents.policy import no_statistics, normalize
 from genidm.agents.remembering import Remembering
 from genidm.agents.sac import SAC
@@ -295,8 +295,34 @@ def actions(agent: OffPolicy, count: int = 4000) -> tuple[np.ndarray, np.ndarray
     x = minibatch().observation[0]
     numbers = jax.vmap(algorithm(agent).draw)(jax.random.split(jax.random.key(1), count))
     act = jax.jit(algorithm(agent).act)
-    a = act(statistics(), policy, jnp.broadcast_to(x, (count, *x.shape)), numbers)
-    return np.asarray(a), mu(float64(policy), np.asarray(x))
+    a, intended = act(statistics(), policy, jnp.broadcast_to(x, (count, *x.shape)), numbers)
+    raw = mu(float64(policy), np.asarray(x))
+    expected = np.broadcast_to(np.tanh(raw[:ACTIONS]), (count, ACTIONS))
+    np.testing.assert_allclose(intended, expected, rtol=0, atol=1e-5)
+    return np.asarray(a), raw
+
+
+def test_half_of_a_minibatch_is_reflected() -> None:
+    rng = np.random.default_rng(2)
+    s, goal = rng.normal(size=(2, BATCH, ROBOT.observation.size)), rng.normal(size=(2, BATCH, 3))
+    x, x_next = jnp.float32(np.concatenate([s, goal], axis=-1))
+    batch = minibatch()._replace(observation=x, next_observation=x_next)
+    mixed = half_mirrored(ROBOT, batch, jax.random.key(0))
+    reflected = np.asarray(mixed.action[:, 1] != batch.action[:, 1])
+    assert 0.3 < reflected.mean() < 0.7
+
+    def mirrored(x: jax.Array) -> np.ndarray:
+        s, goal = np.split(np.asarray(x), [ROBOT.observation.size], axis=-1)
+        return np.concatenate([ROBOT.observation.mirror(s), goal * [1, -1, 1]], axis=-1)
+
+    expected = batch._replace(
+        observation=mirrored(batch.observation),
+        next_observation=mirrored(batch.next_observation),
+        action=batch.action * jnp.array([1, -1, -1]),
+    )
+    for ours, plain, mirror in zip(leaves(mixed), leaves(batch), leaves(expected), strict=True):
+        close(ours[reflected], mirror[reflected], atol=1e-6)
+        close(ours[~reflected], plain[~reflected], atol=1e-6)
 
 
 def test_ddpg_explores_around_its_policy_and_at_times_anywhere() -> None:
@@ -440,7 +466,7 @@ def test_with_hindsight_ddpg_goes_there_too() -> None:
 def test_recording_changes_no_parameter_by_a_bit(name: str, monkeypatch) -> None:
     agent, task = LEARNERS[name]
     recording = undisturbed(name)[1]
-    monkeypatch.setattr(unroll, "record", lambda step: None)
+    monkeypatch.setattr(unroll, "record", lambda step, intended: None)
     blind = agent.learning(ROBOT, task, devices.mesh())
     learner = blind.place(jax.jit(blind.start)(jax.random.key(0)))
     iterate = blind.prepare(learner)

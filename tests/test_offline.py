@@ -399,7 +399,7 @@ def test_the_paper_s_settings_do_not_apply_to_a_row(tmp_path: Path) -> None:
 
 def test_a_row_is_made_tested_and_shown(tmp_path: Path, one_bank: None, capsys) -> None:
     row = by_name("HIQL_G")
-    ge = tiny(methods.GE)
+    ge = small_cells.GE
     row = dataclasses.replace(
         row, agent=ge.agent, task=ge.task, generalize=ge.generalize, learner=SMALL["HIQL"]
     )

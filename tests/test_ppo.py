@@ -111,8 +111,10 @@ def test_recording_changes_no_parameter_by_a_bit(monkeypatch) -> None:
     recording = undisturbed()[1]
     of_step = unroll.record  # PPO learns from the states and actions of its own record
 
-    def least(step: Transition) -> Any:
-        return of_step(step).replace(o_next=None, first=None, last=None, valid=None, physics=None)
+    def least(step: Transition, intended: Any) -> Any:
+        return of_step(step, intended).replace(
+            o_next=None, first=None, last=None, valid=None, physics=None
+        )
 
     monkeypatch.setattr(unroll, "record", least)
     blind = AGENT.learning(ROBOT, TASK, devices.mesh())
@@ -162,11 +164,11 @@ def walked() -> tuple[Any, BraxTransition, Transition, Any]:
     def draw(key: jax.Array) -> jax.Array:
         return jax.random.normal(key, (ROBOT.action.size,))
 
-    def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, Any]:
+    def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         logits = NETWORKS.policy_network.apply(statistics, policy, x)
         mean, scale = jnp.split(logits, 2, axis=-1)
         raw = mean + (jax.nn.softplus(scale) + 0.001) * noise  # as Brax's distribution has it
-        return distribution.postprocess(raw), (logits, raw)
+        return distribution.postprocess(raw), jnp.tanh(mean), (logits, raw)
 
     whole = functools.partial(
         generate_unroll,
@@ -220,6 +222,47 @@ def test_our_transitions_give_the_loss_of_braxs_own_layout() -> None:
     assert batch.next_observation.shape[0] == 1
     close(ours, braxs, atol=1e-5)
     assert abs(ours[0]) > 1e-2
+
+
+def test_the_record_holds_the_action_before_exploration() -> None:
+    record, _ = gather(iterations=1)
+    begun = jax.jit(PREPARED.learning(ROBOT, TASK, devices.mesh()).start)(jax.random.key(0))
+    policy = AGENT.policy(ROBOT, TASK, begun)
+    close(record.intended, policy(record.s, np.zeros_like(record.o)), atol=1e-5)
+    assert np.abs(record.a - record.intended).mean() > 0.1
+
+
+def test_the_mirror_image_of_a_step_is_as_likely_and_worth_as_much() -> None:
+    _, batch, _, _ = walked()
+    batch = by_lane(batch)
+    both = ppo.with_mirror_images(ROBOT, batch)
+    lanes = len(batch.reward)
+    assert same(jax.tree.map(lambda x: x[:lanes], both), batch)
+    reflected = jax.tree.map(lambda x: x[lanes:], both)
+    close(reflected.observation, ROBOT.observation.mirror(batch.observation), atol=1e-6)
+    close(reflected.action, batch.action * np.array([1, -1, -1]), atol=1e-6)
+    extras = reflected.extras["policy_extras"]
+    log_prob = NETWORKS.parametric_action_distribution.log_prob
+    close(
+        log_prob(extras["distribution_params"], extras["raw_action"]),
+        batch.extras["policy_extras"]["log_prob"],
+        atol=1e-5,
+    )
+    assert same(reflected.reward, batch.reward)
+    again = ppo.with_mirror_images(ROBOT, reflected)
+    close(jax.tree.map(lambda x: x[lanes:], again), batch, atol=1e-6)
+
+
+def test_learning_from_mirror_images_makes_a_policy_its_own() -> None:
+    def asymmetry(agent: PPO) -> float:
+        record, learner = gather(Prepared(agent), iterations=60)
+        policy = agent.policy(ROBOT, TASK, learner)
+        s, nowhere = jnp.asarray(record.s), jnp.zeros_like(record.o)
+        reflected = policy(ROBOT.observation.mirror(s), nowhere)
+        return float(jnp.abs(reflected - ROBOT.action.mirror(policy(s, nowhere))).mean())
+
+    fast = dataclasses.replace(AGENT, learning_rate=1e-2)
+    assert asymmetry(dataclasses.replace(fast, mirror=True)) < 0.5 * asymmetry(fast)
 
 
 def test_truncation_and_termination_count_as_in_a_slow_gae() -> None:

@@ -11,9 +11,17 @@ from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import scenarios
 from genidm.paper import protocol
 from genidm.paper.fit import Fit
-from genidm.paper.methods import TABLES, GoalConditioned, InverseDynamics, by_name, paper_settings
+from genidm.paper.methods import (
+    TABLES,
+    AnyMethod,
+    GoalConditioned,
+    InverseDynamics,
+    by_name,
+    paper_settings,
+)
 from genidm.robots import ROBOTS, Ant
 from genidm.runs.scale import scale_of
+from genidm.tasks import WalkForward
 
 # Table 2, line by line: interactions; method, architecture, training algorithm.
 TABLE2 = """
@@ -58,9 +66,15 @@ def lines() -> list[tuple[str, str, dict[str, tuple[int, ...]], str]]:
     return rows
 
 
+def letter(name: str, robot: str) -> AnyMethod:
+    """A method with the paper's settings."""
+    method = by_name(name, robot)
+    return paper_settings(method, robot) if isinstance(method, InverseDynamics) else method
+
+
 @pytest.mark.parametrize(("robot", "name", "layers", "algorithm"), lines())
 def test_methods_are_those_of_table_2(robot: str, name: str, layers: dict, algorithm: str) -> None:
-    method = by_name(name, robot)
+    method = letter(name, robot)
     agent = method.agent.agent if isinstance(method.agent, Frozen) else method.agent
     if algorithm == "-":
         assert isinstance(agent, RandomActions)
@@ -83,7 +97,7 @@ def test_methods_are_those_of_table_2(robot: str, name: str, layers: dict, algor
 )
 def test_a_1_2(robot: str, millions: int, learned_from: float, k: int) -> None:
     assert ROBOTS[robot].paper_interactions == millions * 10**6
-    rl, ge, lr = (by_name(name, robot) for name in ("RL", "GE", "LR"))
+    rl, ge, lr = (letter(name, robot) for name in ("RL", "GE", "LR"))
     assert (
         isinstance(rl, InverseDynamics)
         and isinstance(ge, InverseDynamics)
@@ -103,12 +117,14 @@ def test_a_1_2(robot: str, millions: int, learned_from: float, k: int) -> None:
 def test_every_fit_is_adam_at_1e_3_on_minibatches_of_512_and_lambda_is_a_quarter() -> None:
     fits = [m.fit for column in TABLES.values() for m in column if isinstance(m, InverseDynamics)]
     assert {(fit.batch_size, fit.learning_rate) for fit in (*fits, Fit())} == {(512, 1e-3)}
-    for column in TABLES.values():
-        papers = [paper_settings(m) for m in column if isinstance(m, InverseDynamics)]
+    for robot, column in TABLES.items():
+        papers = [paper_settings(m, robot) for m in column if isinstance(m, InverseDynamics)]
         assert {
             (m.fit.latent_loss_weight, m.fit.mean_latent, m.fit.cosine_decay) for m in papers
         } == {(0.25, True, False)}
         assert {m.goal_horizon for m in papers} == {1}
+        assert {(m.task, m.skip, m.labels) for m in papers} == {(WalkForward(), 0.0, "performed")}
+        assert not any(m.nearest_side or m.mirror or m.clip_bearing for m in papers)
 
 
 def test_a_1_3() -> None:
@@ -135,10 +151,10 @@ def test_a_1_3() -> None:
     )
 
 
-def test_a_column_has_the_papers_rows_and_one_more() -> None:
+def test_a_column_has_the_papers_rows_and_two_more() -> None:
     paper = ["RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR"]
     for column in TABLES.values():
-        assert [m.name for m in column] == [*paper, "HF"]
+        assert [m.name for m in column] == [*paper, "HF", "AGENT"]
         assert [m.name for m in column if isinstance(m, GoalConditioned)] == [
             "VGCP",
             "HER_SP",

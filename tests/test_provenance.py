@@ -55,10 +55,10 @@ def test_settings_bring_the_modules_that_define_them(settings, there, absent) ->
 def test_a_stage_depends_on_its_own_code(tmp_path: Path) -> None:
     run = make_run(ROBOT, methods.LR, Options(run_dir=tmp_path, scale="0.001"))
     collected, fitted = run.experience_stage.code, run.controller_stage.code
-    assert {"genidm.agents.ppo", "genidm.runs.run", "genidm.robots.ant"} <= collected.keys()
+    assert {"genidm.agents.ppo", "genidm.runs.recording", "genidm.robots.ant"} <= collected.keys()
     others = {"genidm.paper.fit", "genidm.agents.sac", "genidm.evaluation.evaluate"}
     assert not others & collected.keys()
-    assert {"genidm.paper.fit", "genidm.paper.idm", "genidm.runs.run"} <= fitted.keys()
+    assert {"genidm.paper.fit", "genidm.paper.idm", "genidm.runs.fitting"} <= fitted.keys()
     assert not {"genidm.agents.ppo", "genidm.evaluation.evaluate"} & fitted.keys()
 
 

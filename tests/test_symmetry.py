@@ -192,6 +192,47 @@ def test_torques_transform_as_arm_times_force(rng: np.random.Generator) -> None:
     assert np.allclose(contact.mirror(wrench(arm, force)), expected, atol=1e-5)
 
 
+def test_a_quarter_turn_of_the_axes_is_scipys(rng: np.random.Generator) -> None:
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    v = rng.normal(size=(20, 3))
+    np.testing.assert_allclose(symmetry.turn_axes(v), quarter.inv().apply(v), atol=1e-6)
+    q = Rotation.random(20, random_state=0)
+    turned = np.roll(symmetry.turn_quaternion(np.roll(q.as_quat(), 1, axis=-1)), -1, axis=-1)
+    apart = (q * quarter).inv() * Rotation.from_quat(turned)
+    assert apart.magnitude().max() < 1e-6
+
+
+def test_four_quarter_turns_of_a_body_are_none(rng: np.random.Generator) -> None:
+    legs = symmetry.joints("legs", [3, 2, 1, 0], [1] * 4, "rad", ([1, 2, 3, 0], [1, -1, 1, -1]))
+    layout = Layout((symmetry.quaternion("orientation"), symmetry.body_pseudovector("spin"), legs))
+    q = Rotation.random(9, random_state=1).as_quat(canonical=True)
+    x = np.concatenate([np.roll(q, 1, axis=-1), rng.normal(size=(9, 7))], axis=-1)
+    quarters = np.arange(9) - 4
+    turned = layout.turn_body_by(jnp.asarray(x, jnp.float32), jnp.asarray(quarters))
+    for n, row in zip(quarters, np.asarray(turned), strict=True):
+        expected = jnp.asarray(x[n + 4], jnp.float32)
+        for _ in range(n % 4):
+            expected = layout.turn_body(expected)
+        np.testing.assert_allclose(row, expected, atol=1e-6)
+    np.testing.assert_allclose(turned[0], x[0], atol=1e-6)  # −4 quarters
+
+
+def test_the_nearest_side_is_within_45_degrees() -> None:
+    heading = jnp.linspace(-np.pi, np.pi, 101)
+    for angle in (-2.5, 0.0, 1.3):
+        quarters = symmetry.quarters_to(jnp.float32(angle), heading)
+        off = symmetry.wrap(heading + quarters * np.pi / 2 - angle)
+        assert jnp.abs(off).max() <= np.pi / 4 + 1e-5
+    assert symmetry.quarters_to(jnp.float32(0.1), jnp.float32(0.0)) == 0
+
+
+def test_a_body_without_quarter_turns_says_so() -> None:
+    layout = Layout((symmetry.joints("arms", [1, 0], [1, 1], "rad"),))
+    assert not layout.can_turn
+    with pytest.raises(ValueError, match="quarter turn"):
+        layout.turn_body(jnp.zeros(2))
+
+
 def test_joints_go_to_the_joint_across() -> None:
     assert FIELDS[4].mirror(jnp.array([1.0, 2.0, 3.0])).tolist() == [-2.0, -1.0, 3.0]
 

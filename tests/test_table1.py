@@ -113,7 +113,7 @@ def counted(*names: str) -> Iterator[Counter]:
 # ── what is run ─────────────────────────────────────────────────────────────────────────────
 
 
-def test_table1_has_the_papers_seven_methods_and_its_rows_one_more() -> None:
+def test_table1_has_the_papers_seven_methods_and_its_rows_two_more() -> None:
     paper = ("RS", "RL", "VGCP", "HER_SP", "HER_DE", "GE", "LR")
     for column in methods.TABLES.values():
         assert tuple(m.name for m in column) == (*paper, *methods.EXTRA) == methods.ORDER
@@ -123,7 +123,7 @@ def test_table1_has_the_papers_seven_methods_and_its_rows_one_more() -> None:
 def test_methods_are_chosen_by_name() -> None:
     assert chosen(Table()) == list(methods.ANT)
     assert chosen(Table(robot="humanoid")) == list(methods.HUMANOID)
-    assert chosen(Table(include_hf=False)) == list(methods.ANT[:-1])
+    assert chosen(Table(include_hf=False)) == list(methods.ANT[:-2])
     assert chosen(Table(methods=("LR", "RS", "LR"))) == [methods.LR, methods.RS]
     with pytest.raises(BadInput, match="'XX'; there are: RS"):
         chosen(Table(methods=("RS", "XX")))
@@ -133,7 +133,7 @@ def test_methods_are_chosen_by_name() -> None:
 
 def test_methods_with_one_experience_follow_each_other() -> None:
     order = [m.name for m in grouped(methods.ANT)]
-    assert order == ["RS", "RL", "GE", "LR", "HF", "VGCP", "HER_SP", "HER_DE"]
+    assert order == ["RS", "RL", "GE", "LR", "HF", "AGENT", "VGCP", "HER_SP", "HER_DE"]
 
 
 def test_the_later_seeds_are_tested_on_the_beginning_of_the_bank(tmp_path: Path) -> None:

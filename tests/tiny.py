@@ -12,9 +12,10 @@ from genidm.agents.random import RandomActions
 from genidm.agents.sac import SAC
 from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.paper.generalize import Generalize
-from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.paper.methods import AgentTurned, GoalConditioned, InverseDynamics
+from genidm.tasks import WalkForward
 
-M = TypeVar("M", GoalConditioned, InverseDynamics)
+M = TypeVar("M", GoalConditioned, InverseDynamics, AgentTurned)
 
 _SIZE = dict(num_envs=16, unroll_length=8)
 _REPLAYING = dict(
@@ -44,13 +45,15 @@ TEST = EvaluationSettings(max_steps=40, num_envs=16, chunk=10)
 
 def tiny(method: M, **changes) -> M:
     """The method with small networks, few updates and short episodes."""
-    fields = dict(
-        agent=AGENTS[type(method.agent)], task=dataclasses.replace(method.task, episode_steps=20)
-    )
+    task = dataclasses.replace(method.task, episode_steps=20)
+    if isinstance(task, WalkForward):
+        task = dataclasses.replace(task, nearest_side=False)  # a point has no sides
+    fields = dict(agent=AGENTS[type(method.agent)], task=task)
     if isinstance(method, InverseDynamics):
         fields |= dict(
             fit=dataclasses.replace(method.fit, updates=200, batch_size=16, idm=(8,), lfm=(8,)),
             generalize=method.generalize and Generalize(segment=6, num_envs=32),
             goal_horizon=5,
+            nearest_side=False,
         )
     return dataclasses.replace(method, **(fields | changes))

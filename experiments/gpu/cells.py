@@ -19,8 +19,9 @@ from genidm.evaluation.scenarios import Scenarios
 from genidm.paper.methods import InverseDynamics, by_name
 from genidm.robots import Robot
 from genidm.runs.cell import make_run, run_method, scenarios_of
+from genidm.runs.fitting import InverseDynamicsRun
 from genidm.runs.resolve import Options
-from genidm.runs.run import InverseDynamicsRun, Run
+from genidm.runs.run import Run
 from genidm.store import Stage
 
 # Interactions of the tiny cell: enough for the first updates of an off-policy learner. It compiles
@@ -94,7 +95,7 @@ def _parts(this: Run[Any], scenarios: Scenarios) -> Iterator[Part]:
         if this.replay_stage:
 
             def again() -> Any:
-                return this.replay(this.experience().first_fraction(share))
+                return this.replay(this.experience().part(share))
 
             yield part("𝒢", this.replay_stage, again)
     learning = part("learning", this.controller_stage, this.controller)

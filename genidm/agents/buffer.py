@@ -22,10 +22,10 @@ class ReplayTransition(flax.struct.PyTreeNode):
     """Stored steps `[...]`; the state after a step is s of the next row.
 
     Attributes:
-      s: `[..., S]`, state before the step.
+      s: `[..., S]`, state before the step, as the policy sees it.
       o: `[..., 3]`, position before the step, metres, world frame.
       o_next: `[..., 3]`, position after the step, before any reset.
-      a: `[..., A]`, action.
+      a: `[..., A]`, action, as the policy chose it.
       goal: `[..., 3]`, metres, world frame; None if the task has no goals.
       cost: control and contact costs.
       fallen: bool, the robot fell, or its physics diverged.
@@ -53,10 +53,10 @@ class ReplayTransition(flax.struct.PyTreeNode):
 def to_replay_transition(robot: Robot, step: Transition) -> ReplayTransition:
     """Convert one transition of B lanes to what the buffer stores, `[B, ...]`."""
     return ReplayTransition(
-        s=step.before.observation,
+        s=step.view.state(robot, step.before),
         o=step.before.position,
         o_next=step.after.position,
-        a=step.action,
+        a=step.view.seen_action(robot, step.before, step.action),
         goal=step.goal,
         cost=robot.cost(step.after, step.action),
         fallen=step.after.fallen | step.after.diverged,

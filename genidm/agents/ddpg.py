@@ -120,10 +120,11 @@ class DDPG(OffPolicy):
 
         def act(
             statistics: RunningStatisticsState, policy: Any, x: jax.Array, numbers: Any
-        ) -> jax.Array:
+        ) -> tuple[jax.Array, jax.Array]:
             explores, noise, drawn = numbers
-            action = jnp.tanh(networks[0].apply(statistics, policy, x)) + noise
-            return jnp.where(explores[:, None], drawn, jnp.clip(action, -1.0, 1.0))
+            intended = jnp.tanh(networks[0].apply(statistics, policy, x))
+            noisy = jnp.clip(intended + noise, -1.0, 1.0)
+            return jnp.where(explores[:, None], drawn, noisy), intended
 
         def update(
             n: DDPGState, statistics: RunningStatisticsState, batch: BraxTransition, key: jax.Array

@@ -50,6 +50,7 @@ from genidm.tasks import (
     bootstrapped_reward,
     input_size,
     inputs,
+    mirror_inputs,
 )
 
 
@@ -59,14 +60,14 @@ class Algorithm(NamedTuple):
     Attributes:
       start: key → tree of networks and optimizer states; its `policy` chooses actions.
       draw: key → the random numbers for one action of one robot.
-      act: (statistics, policy, inputs `[B, I]`, random numbers `[B, ...]`) → actions `[B, A]`,
-        with exploration.
+      act: (statistics, policy, inputs `[B, I]`, random numbers `[B, ...]`) → actions `[B, A]`
+        with exploration, and without.
       update: (tree, statistics, BraxTransition `[N, ...]`, key) → (tree, losses).
     """
 
     start: Callable[[jax.Array], Any]
     draw: Callable[[jax.Array], Any]
-    act: Callable[[RunningStatisticsState, Any, jax.Array, Any], jax.Array]
+    act: Callable[[RunningStatisticsState, Any, jax.Array, Any], tuple[jax.Array, jax.Array]]
     update: Callable[..., tuple[Any, Metrics]]
 
 
@@ -103,6 +104,7 @@ class OffPolicy(LearningAgent):
       policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
       critic_hidden_layer_sizes: widths of the critics' hidden layers.
       her: settings of relabelling; None keeps the original goals and rewards.
+      mirror: reflect half of the sampled steps, so that the gait becomes its own mirror image.
     """
 
     activation: ClassVar[Activation] = "relu"
@@ -120,6 +122,7 @@ class OffPolicy(LearningAgent):
     policy_hidden_layer_sizes: tuple[int, ...] = (64, 64)
     critic_hidden_layer_sizes: tuple[int, ...] = (256, 256)
     her: HER | None = None
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         check(
@@ -197,6 +200,8 @@ class OffPolicy(LearningAgent):
         def update(tree: Any, key: jax.Array) -> tuple[Any, Metrics]:
             which, how = jax.random.split(key)
             batch = self.sample(robot, task, buffer, left, which)
+            if self.mirror:
+                batch = half_mirrored(robot, batch, jax.random.fold_in(which, 1))
             return algorithm.update(tree, statistics, batch, how)
 
         def learn(tree: Any, keys: jax.Array) -> tuple[Any, Metrics]:
@@ -240,6 +245,21 @@ class OffPolicy(LearningAgent):
         )
 
 
+def half_mirrored(robot: Robot, batch: BraxTransition, key: jax.Array) -> BraxTransition:
+    """A minibatch `[N, ...]` in which every step is reflected (y → −y) with probability ½."""
+    reflected = jax.random.bernoulli(key, 0.5, batch.reward.shape)[:, None]
+
+    def mix(mirror: Callable[[jax.Array], jax.Array], x: jax.Array) -> jax.Array:
+        return jnp.where(reflected, mirror(x), x)
+
+    state = functools.partial(mirror_inputs, robot)
+    return batch._replace(
+        observation=mix(state, batch.observation),
+        action=mix(robot.action.mirror, batch.action),
+        next_observation=mix(state, batch.next_observation),
+    )
+
+
 def _check_room(buffer: Buffer) -> None:
     size = sum(x.nbytes for x in jax.tree.leaves(buffer))
     room = devices.memory() or devices.host_memory()
@@ -259,8 +279,8 @@ def _rollout(
 ) -> tuple[EnvState, Experience, ReplayTransition, Metrics]:
     """Step every lane with exploration; outputs are `[unroll_length, B, ...]`."""
 
-    def choose(x: jax.Array, noise: Any) -> tuple[jax.Array, None]:
-        return algorithm.act(statistics, policy, x, noise), None
+    def choose(x: jax.Array, noise: Any) -> tuple[jax.Array, jax.Array, None]:
+        return *algorithm.act(statistics, policy, x, noise), None
 
     def keep(step: Transition, notes: None) -> ReplayTransition:
         return to_replay_transition(robot, step)

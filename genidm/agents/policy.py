@@ -19,6 +19,7 @@ from flax import linen
 from genidm import files
 from genidm.checks import check_value, layers, one_of
 from genidm.robots.base import Robot
+from genidm.symmetry import quarters_to
 from genidm.tasks import inputs
 
 Activation = Literal["tanh", "relu"]
@@ -46,6 +47,11 @@ def described(robot: Robot) -> dict[str, Any]:
     }
 
 
+def bearing(relative_goal: jax.Array) -> jax.Array:
+    """Direction `[...]` of relative goals `[..., 3]` in the world, radians from +x."""
+    return jnp.arctan2(relative_goal[..., 1], relative_goal[..., 0])
+
+
 class Policy(flax.struct.PyTreeNode):
     """The mean action of a trained policy network, squashed by tanh.
 
@@ -57,6 +63,10 @@ class Policy(flax.struct.PyTreeNode):
       activation: activation of the hidden layers.
       goal_conditioned: whether the input is (s, g − o); if not, it is s.
       robot: the robot that the policy controls.
+      faces_goal: whether s is first rotated so that +x points at the goal. So a policy that walks
+        towards +x walks to the goal, without any fit.
+      nearest_side: whether the side of the body that is nearest to +x counts as its front
+        (`genidm.tasks.WalkForward`).
     """
 
     params: Any
@@ -66,6 +76,8 @@ class Policy(flax.struct.PyTreeNode):
     activation: Activation = flax.struct.field(pytree_node=False)
     goal_conditioned: bool = flax.struct.field(pytree_node=False)
     robot: Robot = flax.struct.field(pytree_node=False)
+    faces_goal: bool = flax.struct.field(pytree_node=False, default=False)
+    nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` for states `[..., S]` and relative goals `[..., 3]`, metres.
@@ -74,6 +86,17 @@ class Policy(flax.struct.PyTreeNode):
           BadInput: the shapes do not fit the robot or each other, or a number is not finite.
         """
         s = self.robot.check_inputs(s, relative_goal)
+        if self.faces_goal:
+            s = self.robot.observation.rotate(s, -bearing(relative_goal))
+        if not self.nearest_side:
+            return self._action(s, relative_goal)
+        heading = self.robot.observation.yaw(s)
+        quarters = quarters_to(jnp.zeros_like(heading), heading)
+        action = self._action(self.robot.observation.turn_body_by(s, quarters), relative_goal)
+        return self.robot.action.turn_body_by(action, -quarters)
+
+    def _action(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
+        """The output `[..., A]` of the network, squashed."""
         x = inputs(s, relative_goal if self.goal_conditioned else None)
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
         out = self._network().apply(self.params, x)
@@ -111,6 +134,8 @@ class Policy(flax.struct.PyTreeNode):
             "policy_hidden_layer_sizes": self.policy_hidden_layer_sizes,
             "activation": self.activation,
             "goal_conditioned": self.goal_conditioned,
+            "faces_goal": self.faces_goal,
+            "nearest_side": self.nearest_side,
         }
         files.save_arrays(path, leaves, meta, overwrite)
 
@@ -121,9 +146,11 @@ class Policy(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the network is not valid.
         """
+        meta = {"faces_goal": False, "nearest_side": False} | meta  # not in older files
+        either = one_of((False, True))
         for name, allowed in (
             ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),
-            ("goal_conditioned", one_of((False, True))),
+            ("goal_conditioned", either), ("faces_goal", either), ("nearest_side", either),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         return cls(
@@ -132,4 +159,6 @@ class Policy(flax.struct.PyTreeNode):
             activation=meta["activation"],
             goal_conditioned=meta["goal_conditioned"],
             robot=robot,
+            faces_goal=meta["faces_goal"],
+            nearest_side=meta["nearest_side"],
         )

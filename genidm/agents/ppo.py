@@ -34,7 +34,7 @@ from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size, inputs
+from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size, mirror_inputs
 
 # The metrics of Brax's loss that are logged.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
@@ -73,6 +73,8 @@ class PPO(LearningAgent):
       policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
       value_hidden_layer_sizes: widths of the value function's hidden layers.
       max_grad_norm: maximum norm of the gradients; larger ones are clipped.
+      mirror: also learn from the mirror image of every step, as rsl_rl does, so that the gait
+        becomes its own mirror image. The mirror image of a step has its old probability.
     """
 
     activation: ClassVar[Activation] = "tanh"
@@ -90,6 +92,7 @@ class PPO(LearningAgent):
     policy_hidden_layer_sizes: tuple[int, ...] = (64, 64)
     value_hidden_layer_sizes: tuple[int, ...] = (64, 64)
     max_grad_norm: float = 1.0
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         check(
@@ -134,7 +137,7 @@ class PPO(LearningAgent):
         rollout = functools.partial(
             _rollout, robot, task, networks, self.unroll_length, self.discounting
         )
-        learn = functools.partial(self._learn, networks, optimizer)
+        learn = functools.partial(self._learn, robot, networks, optimizer)
 
         def start(key: jax.Array) -> AgentState:
             lanes, policy, value, stream = jax.random.split(key, 4)
@@ -155,6 +158,7 @@ class PPO(LearningAgent):
 
     def _learn(
         self,
+        robot: Robot,
         networks: ppo_networks.PPONetworks,
         optimizer: optax.GradientTransformation,
         training: TrainingState,
@@ -162,6 +166,9 @@ class PPO(LearningAgent):
     ) -> tuple[TrainingState, Metrics]:
         """Learn from a batch `[unroll_length, num_envs, ...]`, in shuffled minibatches."""
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
+        if self.mirror:
+            batch = with_mirror_images(robot, batch)
+        lanes = batch.reward.shape[0]
         statistics = running_statistics.update(training.statistics, batch.observation)
         loss = functools.partial(
             compute_ppo_loss,
@@ -182,9 +189,7 @@ class PPO(LearningAgent):
 
         def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
             order, noise = jax.random.split(key)
-            parts = _shuffled(
-                batch, jax.random.permutation(order, self.num_envs), self.num_minibatches
-            )
+            parts = _shuffled(batch, jax.random.permutation(order, lanes), self.num_minibatches)
             return jax.lax.scan(
                 minibatch, carry, (parts, jax.random.split(noise, self.num_minibatches))
             )
@@ -214,16 +219,16 @@ def _rollout(
     def draw(key: jax.Array) -> jax.Array:
         return jax.random.normal(key, (robot.action.size,), jnp.float32)
 
-    def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, Any]:
+    def choose(x: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         logits = networks.policy_network.apply(statistics, policy, x)
         normal = distribution.create_dist(logits)
         raw = normal.loc + normal.scale * noise
-        return distribution.postprocess(raw), (logits, raw)
+        return distribution.postprocess(raw), distribution.postprocess(normal.loc), (logits, raw)
 
     def keep(step: Transition, notes: Any) -> dict[str, Any]:
         logits, raw = notes
         return {
-            "goal": step.goal,
+            "inputs": step.inputs(robot),
             "reward": bootstrapped_reward(step, discounting),
             "discount": 1.0 - step.terminal,
             "truncation": 1.0 * (step.last & ~step.terminal),
@@ -235,26 +240,22 @@ def _rollout(
         robot, task, unroll_length, draw, choose, keep, lanes
     )
     kept["log_prob"] = distribution.log_prob(kept["distribution_params"], kept["raw_action"])
-    return lanes, experience, brax_transition(experience, kept, lanes), seen
+    return lanes, experience, brax_transition(experience.a, kept, lanes.inputs(robot)), seen
 
 
-def brax_transition(
-    experience: Experience, kept: dict[str, Any], lanes: EnvState
-) -> BraxTransition:
+def brax_transition(a: jax.Array, kept: dict[str, Any], after: jax.Array) -> BraxTransition:
     """Convert steps `[T, B]` to the transition that Brax's loss reads.
 
     Args:
-      experience: the steps.
+      a: actions `[T, B, A]`.
       kept: PPO's data for the loss, arrays `[T, B, ...]`.
-      lanes: EnvState `[B]` after the last step. The loss reads only the value of this state, and
+      after: the policy's input `[B, I]` after the last step. The loss reads only its value, and
         ignores it where the last step ended an episode.
     """
-    goal = kept["goal"]
-    after = inputs(lanes.robots.observation, lanes.relative_goal)
     policy_fields = ("distribution_params", "raw_action", "log_prob")
     return BraxTransition(
-        observation=inputs(experience.s, None if goal is None else goal - experience.o),
-        action=experience.a,
+        observation=kept["inputs"],
+        action=a,
         reward=kept["reward"],
         discount=kept["discount"],
         next_observation=after[None],
@@ -263,6 +264,29 @@ def brax_transition(
             "state_extras": {"truncation": kept["truncation"]},
         },
     )
+
+
+def with_mirror_images(robot: Robot, batch: BraxTransition) -> BraxTransition:
+    """A batch `[B, T, ...]` and its reflection y → −y: `[2 B, T, ...]`."""
+    extras = batch.extras["policy_extras"]
+    mean, scale = jnp.split(extras["distribution_params"], 2, axis=-1)
+    # A standard deviation moves to the mirrored joint, but keeps its sign.
+    signs = robot.action.mirror(jnp.ones(robot.action.size))
+    params = [robot.action.mirror(mean), robot.action.mirror(scale) * signs]
+    reflected = batch._replace(
+        observation=mirror_inputs(robot, batch.observation),
+        action=robot.action.mirror(batch.action),
+        next_observation=mirror_inputs(robot, batch.next_observation),
+        extras={
+            **batch.extras,
+            "policy_extras": {
+                **extras,
+                "distribution_params": jnp.concatenate(params, axis=-1),
+                "raw_action": robot.action.mirror(extras["raw_action"]),
+            },
+        },
+    )
+    return jax.tree.map(lambda *x: jnp.concatenate(x), batch, reflected)
 
 
 def _shuffled(batch: Any, order: jax.Array, parts: int) -> Any:

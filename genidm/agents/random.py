@@ -41,8 +41,8 @@ class RandomActions(Agent):
         def draw(key: jax.Array) -> jax.Array:
             return jax.random.uniform(key, (robot.action.size,), jnp.float32, minval=-1.0)
 
-        def choose(_: jax.Array, drawn: jax.Array) -> tuple[jax.Array, None]:
-            return drawn, None
+        def choose(_: jax.Array, drawn: jax.Array) -> tuple[jax.Array, jax.Array, None]:
+            return drawn, drawn, None
 
         def keep(step: Transition, notes: None) -> None:
             """None: this agent does not learn."""

@@ -127,4 +127,5 @@ class LearningAgent(Agent):
             activation=self.activation,
             goal_conditioned=task.goal_conditioned,
             robot=robot,
+            nearest_side=task.nearest_side,
         )

@@ -85,11 +85,12 @@ class SAC(OffPolicy):
 
         def act(
             statistics: RunningStatisticsState, policy: Any, x: jax.Array, noise: jax.Array
-        ) -> jax.Array:
+        ) -> tuple[jax.Array, jax.Array]:
             logits = networks.policy_network.apply(statistics, policy, x)
             distribution = networks.parametric_action_distribution
             normal = distribution.create_dist(logits)
-            return distribution.postprocess(normal.loc + normal.scale * noise)
+            raw = normal.loc + normal.scale * noise
+            return distribution.postprocess(raw), distribution.postprocess(normal.loc)
 
         def update(
             n: SACState, statistics: RunningStatisticsState, batch: BraxTransition, key: jax.Array

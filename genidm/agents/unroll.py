@@ -13,12 +13,13 @@ from genidm.agents.base import Metrics
 from genidm.experience import Experience, record
 from genidm.robots.base import Robot, select
 from genidm.rollout import Move, narrow, rollout
-from genidm.tasks import EnvState, Task, Transition, inputs
+from genidm.tasks import EnvState, Task, Transition
 
 # key → the random numbers of one action.
 Draw = Callable[[jax.Array], Any]
-# (inputs [B, I], random numbers [B, ...]) → (a [B, A], notes for Keep).
-Choose = Callable[[jax.Array, Any], tuple[jax.Array, Any]]
+# (inputs [B, I], random numbers [B, ...]) → (a [B, A], a before exploration [B, A], notes for
+# Keep).
+Choose = Callable[[jax.Array, Any], tuple[jax.Array, jax.Array, Any]]
 # (step [B], notes) → what the learner needs of the step, [B, ...].
 Keep = Callable[[Transition, Any], Any]
 
@@ -60,26 +61,33 @@ def generate_unroll(
     """
     keys = jax.vmap(lambda key: jax.random.split(key, 3))(lanes.keys)
     step_keys = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(keys[:, 1])
-    rows = jax.vmap(jax.vmap(draw))(step_keys)
+
+    def numbers(key: jax.Array) -> tuple[Any, Any]:
+        # `draw` sees the key itself, so that a task without numbers does not change its numbers.
+        return draw(key), task.draw(jax.random.fold_in(key, 1))
+
+    rows = jax.vmap(jax.vmap(numbers))(step_keys)
     fresh = task.start(robot, keys[:, 2])
     carry = _Carry(lanes.replace(keys=keys[:, 0]), fresh, jnp.zeros(lanes.episode_step.shape, bool))
 
     def act(carry: _Carry, row: Any) -> tuple[Any, jax.Array, Any]:
-        lanes = carry.lanes
-        action, notes = choose(inputs(lanes.robots.observation, lanes.relative_goal), row)
-        return lanes.robots, action, notes
+        lanes, (drawn, task_numbers) = carry.lanes, row
+        *actions, notes = choose(lanes.inputs(robot), drawn)
+        action, intended = (lanes.view.robot_action(robot, lanes.robots, a) for a in actions)
+        return lanes.robots, action, (intended, notes, task_numbers)
 
     def watch(carry: _Carry, move: Move) -> tuple[_Carry, Any]:
+        intended, notes, task_numbers = move.notes
         seen = task.transition(robot, carry.lanes, move.action, move.after)
-        kept = record(seen), keep(seen, move.notes), task.metrics(robot, seen)
-        return _reset_ended(robot, task, carry, seen), kept
+        kept = record(seen, intended), keep(seen, notes), task.metrics(robot, seen)
+        return _next(robot, task, carry, seen, task_numbers), kept
 
     carry, kept = rollout(robot, act, watch, carry, rows)
     return (carry.lanes, *narrow(kept))
 
 
-def _reset_ended(robot: Robot, task: Task, carry: _Carry, seen: Transition) -> _Carry:
-    """Replace the lanes whose episode has ended by their fresh states."""
+def _next(robot: Robot, task: Task, carry: _Carry, seen: Transition, numbers: Any) -> _Carry:
+    """The lanes after a step; those whose episode has ended are replaced by their fresh states."""
 
     def refill() -> tuple[EnvState, jax.Array]:
         # A fourth key, because `generate_unroll` uses the first three.
@@ -91,4 +99,5 @@ def _reset_ended(robot: Robot, task: Task, carry: _Carry, seen: Transition) -> _
     none_left = (seen.last & carry.used).any()
     fresh, used = jax.lax.cond(none_left, refill, lambda: (carry.fresh, carry.used))
     going = carry.lanes.replace(robots=seen.after, episode_step=carry.lanes.episode_step + 1)
+    going = task.advance(going, numbers)
     return _Carry(select(seen.last, fresh, going), fresh, used | seen.last)

@@ -1,6 +1,7 @@
 """The rows of the extended table: today's offline goal-conditioned baselines on our records.
 
-A row NAME learns from the record of RL, and NAME_G from that of GE: its first half and 𝒢 of it.
+A row NAME learns from the same part of the record as RL, and NAME_G from what GE learns from: the
+same part as GE and 𝒢 of it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from genidm.offline.gcivl import GCIVL
 from genidm.offline.hiql import HIQL
 from genidm.offline.learner import Learner
 from genidm.paper import methods
-from genidm.paper.methods import FromRecord, GoalConditioned, InverseDynamics
+from genidm.paper.methods import FromRecord
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +29,7 @@ class OfflineGoalConditioned(FromRecord):
     learner: Learner
 
 
-AnyMethod = GoalConditioned | InverseDynamics | OfflineGoalConditioned
+AnyMethod = methods.AnyMethod | OfflineGoalConditioned
 
 LEARNERS: dict[str, Learner] = {"GCBC": GCBC(), "GCIVL": GCIVL(), "HIQL": HIQL(), "CRL": CRL()}
 """Name of a row → its learner."""
@@ -51,9 +52,8 @@ def by_name(name: str, robot: str = "ant") -> AnyMethod:
         if learner and name in EXTENDED and name.endswith(suffix):
             record = methods.by_name(source, robot)
             assert isinstance(record, FromRecord)
-            return OfflineGoalConditioned(
-                name, record.agent, record.task, record.fraction, record.generalize, learner
-            )
+            fields = {f.name: getattr(record, f.name) for f in dataclasses.fields(FromRecord)}
+            return OfflineGoalConditioned(**fields | {"name": name}, learner=learner)
     try:
         return methods.by_name(name, robot)
     except BadInput as error:

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+from tqdm.auto import tqdm
 
-from genidm import devices, trees
+from genidm import devices, symmetry, trees
 from genidm.checks import WIDEST, check, count, layers, number, optional, positive
-from genidm.controller import Controller, Frame, in_frame
+from genidm.controller import Controller, Frame, in_frame, relative_bearing
 from genidm.errors import BadInput
 from genidm.paper import protocol
-from genidm.paper.idm import Architecture, loss_plain, loss_siamese
+from genidm.paper.idm import Architecture, Network, loss_plain, loss_siamese
 from genidm.paper.pairs import Pairs
 from genidm.progress import Progress, compile_ahead
 from genidm.robots.base import Robot
 from genidm.store import Stage
 
 STD_FLOOR = 1e-2
+# The quantiles of the bearing of d that a controller keeps.
+QUANTILES = (0.01, 0.99)
 # A minibatch of this size takes 3 GB for the Ant: two views through two layers of 256.
 MOST_IN_BATCH = 1 << 20
 
@@ -41,6 +46,9 @@ class Fit:
       cosine_decay: reduce the learning rate to 0 along a cosine; False keeps it constant (A.1.2).
       idm: hidden layers of φ (Table 2).
       lfm: hidden layers of ψ (Table 2).
+      network: "mlp": fully connected layers (Table 2); "residual": a block with layer
+        normalisation in place of each layer.
+      weight_decay: of AdamW; 0 is the paper's Adam.
       latent_size: k (Eq. 3); None fits an IDM without an LFM.
       latent_loss_weight: λ, weight of the latent loss (Eq. 7), in (0, 1).
       mean_latent: fit φ to the mean of a pair's latents (Eq. 6); False fits it to each latent.
@@ -53,6 +61,8 @@ class Fit:
     cosine_decay: bool = True
     idm: tuple[int, ...] = (256, 256)
     lfm: tuple[int, ...] = (256, 256)
+    network: Network = "mlp"
+    weight_decay: float = 0.0
     latent_size: int | None = None
     latent_loss_weight: float = protocol.LATENT_WEIGHT
     mean_latent: bool = True
@@ -66,16 +76,22 @@ class Fit:
             learning_rate=positive(),
             idm=layers,
             lfm=layers,
+            weight_decay=number(0),
             latent_size=optional(count(1, WIDEST)),
             latent_loss_weight=number(0, 1, above=True, below=True),
         )
+        for name in ("idm", "lfm") if self.network == "residual" else ():
+            if len(set(sizes := getattr(self, name))) != 1:
+                raise BadInput(f"{name}: residual blocks are all of one width, not {sizes}")
 
     def optimizer(self) -> optax.GradientTransformation:
-        """Make Adam with the learning rate schedule."""
-        rate = self.learning_rate
-        return optax.adam(
-            optax.cosine_decay_schedule(rate, self.updates) if self.cosine_decay else rate
-        )
+        """Make Adam, or AdamW, with the learning rate schedule."""
+        rate: optax.ScalarOrSchedule = self.learning_rate
+        if self.cosine_decay:
+            rate = optax.cosine_decay_schedule(self.learning_rate, self.updates)
+        if self.weight_decay:
+            return optax.adamw(rate, weight_decay=self.weight_decay)
+        return optax.adam(rate)
 
 
 def draw_plain(samples: Pairs, key: jax.Array, size: int) -> Pairs:
@@ -140,6 +156,10 @@ def fit(
     )
     samples = jax.jit(functools.partial(_in_input_frame, robot, input_frame))(samples)
     state, updates = training(robot, samples, key, settings, input_frame)
+    if not quiet:
+        low, high = np.degrees(state.model.bearings).round()
+        said = f"98 % of d lie between {low:.0f}° and {high:.0f}° of the heading"
+        tqdm.write(f"fit: {said}".replace("-", "−"), file=sys.stderr)
     checkpoints = stage.checkpoints() if stage else None
     found = checkpoints.latest(state) if checkpoints else None
     done, state = (found[0], _on_device_of(samples, found[1])) if found else (0, state)
@@ -199,7 +219,9 @@ def _start(
     robot: Robot, samples: Pairs, key: jax.Array, settings: Fit, input_frame: Frame
 ) -> FitState:
     params, stream = jax.random.split(key)
-    architecture = Architecture(robot.action.size, settings.idm, settings.lfm, settings.latent_size)
+    architecture = Architecture(
+        robot.action.size, settings.idm, settings.lfm, settings.latent_size, settings.network
+    )
     mean, std = jax.jit(lambda s: (s.mean((0, 1)), s.std((0, 1))))(samples.s)
     model = Controller(
         params=architecture.init(params, robot.observation.size),
@@ -208,9 +230,25 @@ def _start(
         architecture=architecture,
         input_frame=input_frame,
         robot=robot,
+        bearings=_bearings(robot, samples),
     )
     optimizer = settings.optimizer().init(model.params)
     return _on_device_of(samples, FitState(model, optimizer, stream, jnp.zeros((), jnp.int32)))
+
+
+def _bearings(robot: Robot, samples: Pairs) -> np.ndarray:
+    """Measure `Controller.bearings`; the views of a sample have one bearing, so one view counts.
+
+    The quantiles are taken of the angle to the mean direction, so that they do not depend on
+    where the circle is cut. A range that crosses ±π becomes the full circle.
+    """
+    angle = np.asarray(
+        jax.jit(lambda x: relative_bearing(robot, x.s[0], x.d[0]))(samples), np.float64
+    )
+    centre = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean())
+    low, high = centre + np.quantile(np.asarray(symmetry.wrap(angle - centre)), QUANTILES)
+    known = -np.pi <= low and high <= np.pi
+    return np.array([low, high] if known else [-np.pi, np.pi], np.float32)
 
 
 def _updates(settings: Fit) -> Any:

@@ -7,13 +7,16 @@ in place of (s, o, o') (Remark 2). Eq. 2 is in `pairs`.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from genidm.paper.pairs import Pairs
+
+# SimBa's ratio of a block's inner width to its width.
+EXPANSION = 4
 
 
 class MLP(nn.Module):
@@ -34,7 +37,33 @@ class MLP(nn.Module):
         return nn.Dense(self.outputs)(x)
 
 
-def _apply(model: MLP, params: Any, x: jax.Array) -> jax.Array:
+class ResidualMLP(nn.Module):
+    """Residual blocks with layer normalisation, as in SimBa (Lee et al. 2024, arXiv 2410.09754).
+
+    A block adds to its input x a layer of ReLU, `EXPANSION` times as wide, of the normalised x.
+
+    Attributes:
+      hidden_layer_sizes: width of each block; all are equal.
+      outputs: width of the output.
+    """
+
+    hidden_layer_sizes: tuple[int, ...]
+    outputs: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        x = nn.Dense(self.hidden_layer_sizes[0])(x)
+        for width in self.hidden_layer_sizes:
+            wide = nn.relu(nn.Dense(EXPANSION * width)(nn.LayerNorm()(x)))
+            x = x + nn.Dense(width)(wide)
+        return nn.Dense(self.outputs)(nn.LayerNorm()(x))
+
+
+Network = Literal["mlp", "residual"]
+NETWORKS: dict[Network, type[MLP] | type[ResidualMLP]] = {"mlp": MLP, "residual": ResidualMLP}
+
+
+def _apply(model: Any, params: Any, x: jax.Array) -> jax.Array:
     out = model.apply(params, x)
     assert isinstance(out, jax.Array)  # not (out, state): no collection is mutable
     return out
@@ -49,12 +78,14 @@ class Architecture:
       idm: hidden layers of φ.
       lfm: hidden layers of ψ; unused without a latent.
       latent_size: k, or None for an IDM without LFM (RS, RL, GE).
+      network: "mlp" (the paper's), or "residual".
     """
 
     action_size: int
     idm: tuple[int, ...]
     lfm: tuple[int, ...]
     latent_size: int | None
+    network: Network = "mlp"
 
     def init(self, key: jax.Array, state_size: int) -> dict[str, object]:
         """Initialise parameters: {"idm": …} and, with a latent, {"lfm": …}."""
@@ -67,11 +98,11 @@ class Architecture:
             "idm": self._idm().init(phi, jnp.zeros(self.latent_size, jnp.float32)),
         }
 
-    def _idm(self) -> MLP:
-        return MLP(self.idm, self.action_size)
+    def _idm(self) -> MLP | ResidualMLP:
+        return NETWORKS[self.network](self.idm, self.action_size)
 
-    def _lfm(self) -> MLP:
-        return MLP(self.lfm, self.latent_size or 0)
+    def _lfm(self) -> MLP | ResidualMLP:
+        return NETWORKS[self.network](self.lfm, self.latent_size or 0)
 
     def latent(self, params: dict, s: jax.Array, d: jax.Array) -> jax.Array:
         """Compute ψ(s, d) = γ `[..., k]` (Def. 5, Eq. 3); without an LFM, (s, d) `[..., S + 3]`.

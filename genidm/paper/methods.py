@@ -7,6 +7,7 @@ with `dataclasses.replace` and change one thing.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from genidm.agents.base import Agent
@@ -17,12 +18,13 @@ from genidm.agents.ppo import PPO
 from genidm.agents.random import RandomActions
 from genidm.agents.rollout_then_learn import LearningAgent
 from genidm.agents.sac import SAC
-from genidm.checks import check, check_value, count, label, positive
+from genidm.checks import check, check_value, count, label, number, positive
 from genidm.controller import Frame
 from genidm.errors import BadInput
 from genidm.paper import protocol
 from genidm.paper.fit import Fit
 from genidm.paper.generalize import Generalize
+from genidm.paper.pairs import Labels
 from genidm.tasks import Dense, GoToGoal, Sparse, WalkForward
 
 
@@ -57,17 +59,24 @@ class FromRecord(Method):
     """A method that learns a controller from a record of experience without goals.
 
     Attributes:
-      fraction: fraction of the record, from its start, to learn from. For the paper's GE and
-        LR, 𝒢 makes the other half (A.1.2).
+      fraction: fraction of the record to learn from. For the paper's GE and LR, 𝒢 makes the
+        other half (A.1.2).
       generalize: settings of 𝒢; None learns from the record only.
+      skip: fraction of the record to leave out before that part; 0 takes the first part, as the
+        paper does, and 1 − fraction the last.
     """
 
     fraction: float
     generalize: Generalize | None
+    skip: float = dataclasses.field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, fraction=positive(1))
+        check(self, fraction=positive(1), skip=number(0, 1))
+        if self.fraction + self.skip > 1 + 1e-9:
+            raise BadInput(
+                f"skip {self.skip:g} and fraction {self.fraction:g} are more than the record"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,19 +89,37 @@ class InverseDynamics(FromRecord):
       mirror: add the reflection of every sample; not in the paper.
       input_frame: "heading" rotates every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
+      labels: the recorded actions to learn: "performed" (the paper's), or "intended", the agent's
+        choice before exploration.
+      clip_bearing: at run time, rotate d into the range of bearings of the samples where it lies
+        outside (`Controller.bearings`); not in the paper.
+      nearest_side: count the side of the body that is nearest to d as its front, for a body with
+        four equal sides; not in the paper.
     """
 
     goal_horizon: int
     mirror: bool
     input_frame: Frame
     fit: Fit
+    labels: Labels = "performed"
+    clip_bearing: bool = False
+    nearest_side: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, goal_horizon=count())
 
 
-Methods = tuple[GoalConditioned | InverseDynamics, ...]
+@dataclasses.dataclass(frozen=True)
+class AgentTurned(Method):
+    """The agent itself, with the world turned so that +x points at the goal: no fit at all.
+
+    It is not in the paper. A fit to the agent's experience should steer better than this.
+    """
+
+
+AnyMethod = GoalConditioned | InverseDynamics | AgentTurned
+Methods = tuple[AnyMethod, ...]
 Column = tuple[
     InverseDynamics,
     InverseDynamics,
@@ -102,14 +129,16 @@ Column = tuple[
     InverseDynamics,
     InverseDynamics,
     InverseDynamics,
+    AgentTurned,
 ]
 
 WALK = WalkForward()
+"""The paper's task of collection: every episode starts facing +x, and +x never changes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """Our settings for a robot where the paper is silent.
+    """Our settings for a robot, where the paper is silent or where ours come nearer (docs).
 
     The hidden layers of every policy are those of Table 2, not those of these agents.
 
@@ -117,15 +146,32 @@ class Choices:
       ppo: settings of PPO.
       sac: settings of SAC.
       ddpg: settings of DDPG.
-      goal_horizon: h of RS.
-      mirror: whether HF also learns from mirror images; True if the gait is symmetric.
+      walk: task of collection: a turning world.
+      skip: fraction of the record to leave out. An agent that still learns to walk has nothing to
+        teach; a frozen agent's record has no such part.
+      goal_horizon: h.
+      goal_horizon_of_random: h of RS.
+      idm: hidden layers of φ without an LFM.
+      lfm: hidden layers of ψ.
+      idm_of_latent: hidden layers of φ after an LFM.
+      updates: updates of a fit.
+      nearest_side: whether the side of the body nearest to d counts as its front.
+      mirror: whether HF also learns from mirror images.
     """
 
     ppo: PPO = dataclasses.field(default_factory=PPO)
     sac: SAC = dataclasses.field(default_factory=SAC)
     ddpg: DDPG = dataclasses.field(default_factory=DDPG)
-    goal_horizon: int = 100
-    mirror: bool = True
+    walk: WalkForward = WALK
+    skip: float = 0.5
+    goal_horizon: int = 50
+    goal_horizon_of_random: int = 100
+    idm: tuple[int, ...] = (256, 256, 256, 256)
+    lfm: tuple[int, ...] = (256, 256, 256, 256)
+    idm_of_latent: tuple[int, ...] = (256, 256)
+    updates: int = 10_000
+    nearest_side: bool = False
+    mirror: bool = False
 
     def agent(self, training: protocol.Training, her: HER | None = None) -> LearningAgent:
         """Make the agent of a row of Table 2."""
@@ -140,42 +186,58 @@ class Choices:
 
 
 def column(robot: str, choices: Choices) -> Column:
-    """Make the methods of Table 1 for one robot, with the settings of Table 2 and A.1.2.
+    """Make our methods for one robot; `paper_settings` gives those of Table 2 and A.1.2.
 
-    The last is HF, which is not in the paper: RL in the heading frame.
+    The last two are not in the paper: HF is RL in the heading frame, and AGENT the agent itself,
+    turned towards the goal.
     """
     table = protocol.TABLE2[robot]
 
-    def inverse(name: str, latent_size: int | None = None) -> InverseDynamics:
-        idm, lfm = table[name].idm or (), table[name].lfm or Fit.lfm
+    def inverse(name: str) -> InverseDynamics:
+        latent = table[name].lfm is not None
+        fit = Fit(
+            updates=choices.updates,
+            idm=choices.idm_of_latent if latent else choices.idm,
+            lfm=choices.lfm,
+            latent_size=protocol.LATENT_SIZE[robot] if latent else None,
+            latent_loss_weight=0.75,
+            mean_latent=False,
+        )
         return InverseDynamics(
             name=name,
             agent=_collector(robot, choices, table[name]),
-            task=WALK,
-            fraction=protocol.FRACTION[name],
+            task=choices.walk,
+            fraction=1 - choices.skip,
+            skip=choices.skip,
             generalize=Generalize() if name in ("GE", "LR") else None,
-            goal_horizon=100,
+            goal_horizon=choices.goal_horizon,
             mirror=False,
             input_frame="world",
-            fit=Fit(idm=idm, lfm=lfm, latent_size=latent_size),
+            nearest_side=choices.nearest_side,
+            fit=fit,
         )
 
     def direct(name: str, task: GoToGoal, her: HER | None = None) -> GoalConditioned:
         return GoalConditioned(name, choices.agent(table[name], her), task)
 
-    lr = inverse("LR", protocol.LATENT_SIZE[robot])
-    # These come nearer than the paper's (docs/choices.md), which `paper_settings` has.
-    lr_fit = dataclasses.replace(lr.fit, latent_loss_weight=0.75, mean_latent=False)
     rl = inverse("RL")
     return (
-        dataclasses.replace(inverse("RS"), goal_horizon=choices.goal_horizon),
+        _of_random(inverse("RS"), choices),
         rl,
         direct("VGCP", GoToGoal()),
         direct("HER_SP", GoToGoal(reward=Sparse()), HER()),
         direct("HER_DE", GoToGoal(reward=Dense()), HER()),
         inverse("GE"),
-        dataclasses.replace(lr, fit=lr_fit),
+        inverse("LR"),
         dataclasses.replace(rl, name="HF", mirror=choices.mirror, input_frame="heading"),
+        AgentTurned("AGENT", rl.agent, rl.task),
+    )
+
+
+def _of_random(method: InverseDynamics, choices: Choices) -> InverseDynamics:
+    """A method that learns from random actions, which have no frame and no best part."""
+    return dataclasses.replace(
+        method, task=WALK, fraction=1.0, skip=0.0, goal_horizon=choices.goal_horizon_of_random
     )
 
 
@@ -189,16 +251,23 @@ def _collector(robot: str, choices: Choices, training: protocol.Training) -> Age
     return Frozen(agent, fraction=before / protocol.INTERACTIONS[robot])
 
 
-ANT = column("ant", Choices())
+ANT = column(
+    "ant",
+    Choices(
+        walk=WalkForward(start_yaw=0.5, turn_rate=0.01, turn_spread=math.pi, nearest_side=True),
+        goal_horizon=25,
+        nearest_side=True,
+    ),
+)
 HUMANOID = column(
     "humanoid",
     Choices(
         # A step is 0.0165 s: 0.98 looks 0.8 s ahead only, and the robot throws itself forwards.
-        sac=SAC(grad_updates_per_step=64, discounting=0.99, layer_norm=True),
+        sac=SAC(grad_updates_per_step=16, discounting=0.99, layer_norm=True),
+        walk=WalkForward(start_yaw=0.5, turn_rate=0.01, turn_spread=1.0),
+        skip=0.0,
         # Random actions make the robot fall within 25 steps: a longer horizon has few samples.
-        goal_horizon=10,
-        # The gait is not symmetric: with mirror images, HF falls (docs/choices.md).
-        mirror=False,
+        goal_horizon_of_random=10,
     ),
 )
 MINITAUR = column(
@@ -207,14 +276,16 @@ MINITAUR = column(
         # The robot stands by itself, and an entropy bonus would hide the gait in noise
         # (docs/choices.md).
         ppo=PPO(entropy_cost=0.0),
-        # This gait veers to one side: it is not symmetric either.
-        mirror=False,
+        walk=WalkForward(start_yaw=0.5, turn_rate=0.01, turn_spread=1.0),
     ),
 )
 
-RS, RL, VGCP, HER_SP, HER_DE, GE, LR, HF = ANT
+# A user's robot: its forward direction turns, and its body may have no four equal sides.
+OTHER = column("ant", Choices(walk=WalkForward(start_yaw=0.5, turn_rate=0.01)))
 
-EXTRA = ("HF",)
+RS, RL, VGCP, HER_SP, HER_DE, GE, LR, HF, AGENT = ANT
+
+EXTRA = ("HF", "AGENT")
 """Methods that are not in the paper."""
 
 ORDER = tuple(method.name for method in ANT)
@@ -226,36 +297,57 @@ TABLES = {
     "humanoid_world": HUMANOID,
     "minitaur": MINITAUR,
 }
-"""Robot → the methods of its column; other robots use the Ant's."""
+"""Robot → the methods of its column; other robots use `OTHER`."""
 
 
-def by_name(name: str, robot: str = "ant") -> GoalConditioned | InverseDynamics:
+def by_name(name: str, robot: str = "ant") -> AnyMethod:
     """Find a method by its name, with its settings for a robot.
 
     Raises:
       BadInput: no method has this name.
     """
-    for method in TABLES.get(robot, ANT):
+    for method in TABLES.get(robot, OTHER):
         if method.name == name:
             return method
     raise BadInput(f"no method is called {name!r}; there are: {', '.join(ORDER)}")
 
 
-def paper_settings(method: InverseDynamics) -> InverseDynamics:
+def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
     """Give a method the paper's settings where ours differ.
 
-    h = 1 (Def. 1), whole-episode replay (§5.2), λ = 0.25 (A.1.2), φ fitted to mean latents
-    (Eq. 6), and Adam with a constant learning rate (A.1.2).
+    A world that does not turn, h = 1 (Def. 1), whole-episode replay (§5.2), φ fitted to mean
+    latents (Eq. 6), d as it is (Remark 2), λ = 0.25, Adam with a constant learning rate, and the
+    first part of the record (A.1.2). The networks are those of Table 2 where it has the method and
+    the robot.
+
+    Args:
+      method: the method.
+      robot: name of the robot.
     """
+    name = method.name.removesuffix(" paper")
+    row = protocol.TABLE2.get(robot, {}).get(name, protocol.Training())
+    fit = dataclasses.replace(
+        method.fit,
+        updates=Fit.updates,
+        idm=row.idm or method.fit.idm,
+        lfm=row.lfm or method.fit.lfm,
+        network="mlp",
+        weight_decay=0.0,
+        latent_loss_weight=protocol.LATENT_WEIGHT,
+        mean_latent=True,
+        cosine_decay=False,
+    )
     return dataclasses.replace(
         method,
-        name=f"{method.name} paper",
+        name=f"{name} paper",
+        task=WALK,
+        fraction=protocol.FRACTION.get(name, 1.0),
+        skip=0.0,
+        labels="performed",
         goal_horizon=1,
+        clip_bearing=False,
+        nearest_side=False,
+        mirror=False,
         generalize=method.generalize and dataclasses.replace(method.generalize, mode="episodes"),
-        fit=dataclasses.replace(
-            method.fit,
-            latent_loss_weight=protocol.LATENT_WEIGHT,
-            mean_latent=True,
-            cosine_decay=False,
-        ),
+        fit=fit,
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -20,6 +21,11 @@ from genidm.robots.base import Robot
 
 # A warning is shown if less than this fraction of the record can be learned from.
 FEW = 0.25
+# Fraction of the samples that a fit does not see, so that its error can be measured on them.
+HELD_OUT = 0.02
+# Samples to turn at once.
+AT_ONCE = 1 << 17
+Labels = Literal["performed", "intended"]
 # d rotates and mirrors by the same rules as the fields of a layout.
 DIRECTION = symmetry.vector("direction", unit="1")
 
@@ -40,6 +46,10 @@ class Pairs(flax.struct.PyTreeNode):
     d: Any
     a: Any
 
+    def part(self, which: slice) -> Pairs:
+        """Select samples, in all their views."""
+        return Pairs(self.s[:, which], self.d[:, which], self.a[which])
+
 
 def pairs(
     robot: Robot,
@@ -48,6 +58,8 @@ def pairs(
     *,
     goal_horizon: int = 100,
     mirror: bool = False,
+    labels: Labels = "performed",
+    nearest_side: bool = False,
 ) -> Pairs:
     """Make the samples of a fit: the record, its rotated copies, and their reflections.
 
@@ -59,11 +71,78 @@ def pairs(
         position". Steps whose episode ends earlier are left out. If o' lies after the end
         of a replayed segment, the rotated o' of the record is used.
       mirror: add the reflection y → −y of every sample, in every view.
+      labels: the actions of the samples: "performed", or "intended", before exploration.
+      nearest_side: see `with_nearest_side`.
 
     Raises:
       BadInput: goal_horizon is not a whole number ≥ 1, or is longer than every episode, or
-        the record is invalid.
+        the record is invalid, or it has no intended actions.
     """
+    record = _usable(robot, experience, turned, goal_horizon, labels)
+    return _samples(robot, record, record.usable, mirror, nearest_side)
+
+
+def split_pairs(
+    robot: Robot,
+    experience: Experience,
+    turned: RotatedReplay | None = None,
+    *,
+    goal_horizon: int = 100,
+    mirror: bool = False,
+    labels: Labels = "performed",
+    nearest_side: bool = False,
+) -> tuple[Pairs, Pairs]:
+    """Make `pairs`, and keep those of a few episodes apart, to measure the error of the fit.
+
+    Whole episodes are drawn at random until they hold 2 % of the samples. An episode with more
+    than 2 % of the samples (a short log) counts as several, of consecutive samples. The draw
+    depends on the record alone, so that all fits to it have the same held-out episodes.
+
+    Args:
+      robot: robot of the record.
+      experience: E, `[T, B, ...]`.
+      turned: 𝒢(E), or None for the record only.
+      goal_horizon: h, as in `pairs`.
+      mirror: add the reflection of every sample.
+      labels: the actions of the samples.
+      nearest_side: see `with_nearest_side`.
+
+    Returns:
+      the samples of the fit, and the held-out samples, with their copies and reflections. If the
+      record has one sample only, nothing is held out, and N is 0.
+
+    Raises:
+      BadInput: as in `pairs`.
+    """
+    record = _usable(robot, experience, turned, goal_horizon, labels)
+    held_out = _held_out(record.begins, record.usable)
+    fitted = _samples(robot, record, record.usable & ~held_out, mirror, nearest_side)
+    return fitted, _samples(robot, record, held_out, mirror, nearest_side)
+
+
+class _Usable(NamedTuple):
+    """A record before its samples are selected.
+
+    Attributes:
+      views: (s `[T, B, S]`, o' − o `[T, B, 3]`) of each view.
+      a: actions `[T, B, A]`.
+      begins: `[T, B]` bool, the first step of an episode.
+      usable: `[T, B]` bool, whether the step is a sample.
+    """
+
+    views: list[tuple[np.ndarray, np.ndarray]]
+    a: np.ndarray
+    begins: np.ndarray
+    usable: np.ndarray
+
+
+def _usable(
+    robot: Robot,
+    experience: Experience,
+    turned: RotatedReplay | None,
+    goal_horizon: int,
+    labels: Labels,
+) -> _Usable:
     check_value("goal_horizon", goal_horizon, count())
     experience = experience.prepared(robot)
     goal, exists = map(np.asarray, goal_step(jnp.asarray(experience.ends), goal_horizon))
@@ -75,18 +154,33 @@ def pairs(
     for copy in _copies(turned):
         views.append((copy.s, _goal(copy, goal, recorded) - copy.o))
         valid = valid & copy.valid
+    _check_enough(goal_horizon, exists, valid)
+    for _, move in views:
+        valid = valid & (np.linalg.norm(move, axis=-1) > 1e-6)
+    if not valid.any():
+        raise BadInput("no sample can be learned from: no valid step moves the robot")
+    return _Usable(views, _labels(experience, labels), experience.begins, valid)
+
+
+def _check_enough(goal_horizon: int, exists: np.ndarray, valid: np.ndarray) -> None:
+    """Warn if few steps can be learned from; raise BadInput if all episodes are too short."""
     if 0 < valid.mean() < FEW:
         said = (
             f"goal_horizon {goal_horizon} leaves {valid.sum()} of {valid.size} steps to learn from"
         )
-        warnings.warn(f"{said}: the episodes of the other steps end earlier", stacklevel=2)
+        warnings.warn(f"{said}: the episodes of the other steps end earlier", stacklevel=4)
     if not exists.any():
         raise BadInput(
             f"no episode lasts goal_horizon = {goal_horizon} steps: reduce it "
             "(--method.goal-horizon), or collect more (--scale)"
         )
-    out = _samples(views, experience.a, valid)
-    return with_reflection(robot, out) if mirror else out
+
+
+def _labels(experience: Experience, labels: Labels) -> np.ndarray:
+    a = experience.a if labels == "performed" else experience.intended
+    if a is None:
+        raise BadInput('this record has no intended actions: use the labels "performed"')
+    return np.asarray(a)
 
 
 def _warn_of_invalid_steps(experience: Experience) -> None:
@@ -95,7 +189,7 @@ def _warn_of_invalid_steps(experience: Experience) -> None:
         invalid = ~experience.valid
         t, lane = np.argwhere(invalid)[0]
         said = f"{invalid.sum()} of {invalid.size} steps are not valid and left out"
-        warnings.warn(f"{said}, first [{t}, {lane}]", stacklevel=3)
+        warnings.warn(f"{said}, first [{t}, {lane}]", stacklevel=4)
 
 
 def _copies(turned: RotatedReplay | None) -> Iterator[RotatedReplay]:
@@ -116,15 +210,60 @@ def _goal(copy: RotatedReplay, goal: np.ndarray, recorded: np.ndarray) -> np.nda
     return np.where(same_segment[..., None], replayed, exact)
 
 
-def _samples(views: list[tuple[np.ndarray, np.ndarray]], a: np.ndarray, valid: np.ndarray) -> Pairs:
-    """Pairs from views (s, o' − o) `[T, B, ...]`; samples without a direction d are left out."""
-    length = np.stack([np.linalg.norm(move, axis=-1) for _, move in views])
-    keep = valid & (length > 1e-6).all(axis=0)
-    if not keep.any():
-        raise BadInput("no sample can be learned from: no valid step moves the robot")
-    s = np.stack([s[keep] for s, _ in views])
-    d = np.stack([move[keep] for _, move in views]) / length[:, keep, None]
-    return Pairs(s, d, a[keep])
+def _held_out(begins: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Draw the held-out samples `[T, B]` bool: whole episodes, or parts of long ones."""
+    lane, time = np.nonzero(usable.T)
+    most = math.ceil(HELD_OUT * len(time))
+    episode = np.cumsum(begins, axis=0)[time, lane]
+    starts = np.append(True, (np.diff(lane) != 0) | (np.diff(episode) != 0))
+    sample = np.arange(len(time))
+    within = sample - np.maximum.accumulate(np.where(starts, sample, 0))
+    group = np.cumsum(within % most == 0) - 1
+    sizes = np.bincount(group)
+    order = np.random.default_rng(0).permutation(len(sizes))
+    drawn = max(1, np.count_nonzero(np.cumsum(sizes[order]) <= most))
+    out = np.zeros_like(usable)
+    out[time, lane] = np.isin(group, order[:drawn]) & (len(sizes) > 1)
+    return out
+
+
+def _samples(
+    robot: Robot, record: _Usable, keep: np.ndarray, mirror: bool, nearest_side: bool
+) -> Pairs:
+    """Pairs of the steps of a record that `keep [T, B]` selects."""
+    moves = np.stack([move[keep] for _, move in record.views])
+    d = moves / np.linalg.norm(moves, axis=-1, keepdims=True)
+    out = Pairs(np.stack([s[keep] for s, _ in record.views]), d, record.a[keep])
+    if nearest_side:
+        out = with_nearest_side(robot, out)
+    return with_reflection(robot, out) if mirror else out
+
+
+def with_nearest_side(robot: Robot, samples: Pairs) -> Pairs:
+    """Turn the body's axes in every sample, so that the side nearest to d is its front.
+
+    This uses the symmetry of a body with four equal sides (the Ant): d is then within ±45° of the
+    heading in all samples. All views of a sample turn by the same quarters.
+
+    Raises:
+      BadInput: the robot has no such body.
+    """
+    if not robot.can_turn_body:
+        raise BadInput(f"nearest_side needs a body with four equal sides, not the {robot.name}")
+    yaw, state, action = robot.observation.yaw, robot.observation, robot.action
+
+    @jax.jit
+    def turn(part: Pairs) -> Pairs:
+        angle = jnp.arctan2(part.d[0, :, 1], part.d[0, :, 0])
+        quarters = symmetry.quarters_to(angle, yaw(part.s[0]))
+        s = state.turn_body_by(part.s, jnp.broadcast_to(quarters, part.s.shape[:2]))
+        return Pairs(s, part.d, action.turn_body_by(part.a, quarters))
+
+    # In parts, because all samples at once would need five times their memory.
+    edges = range(0, len(samples.a), AT_ONCE)
+    parts = [turn(samples.part(slice(i, i + AT_ONCE))) for i in edges]
+    s, a = [np.asarray(p.s) for p in parts], [np.asarray(p.a) for p in parts]
+    return Pairs(np.concatenate(s, axis=1), samples.d, np.concatenate(a))
 
 
 def with_reflection(robot: Robot, samples: Pairs) -> Pairs:

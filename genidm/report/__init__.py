@@ -10,6 +10,7 @@ from genidm.report.figures import (
     residuals,
     violins,
 )
+from genidm.report.held_out_figure import draw_held_out
 from genidm.report.rows import Row, origin, results
 from genidm.report.table import markdown, text
 from genidm.report.waypoint_figure import draw_waypoint_runs
@@ -18,6 +19,7 @@ __all__ = [
     "TABLE1",
     "Row",
     "bearings",
+    "draw_held_out",
     "draw_waypoint_runs",
     "invariance",
     "latent_sizes",

@@ -31,6 +31,10 @@ class Row:
       invariance: mean change of the action when robot and goal are rotated together
         (`genidm.evaluation.invariance`); None if not measured.
       made: stage → what made it (`origin`).
+      held_out: samples, error, shuffled and nearest of the fit (`genidm.paper.held_out.HeldOut`);
+        None without a fit.
+      bearings: radians; the range of bearings of d in the fit (`Controller.bearings`); None
+        without a fit.
     """
 
     method: str
@@ -41,6 +45,8 @@ class Row:
     training_seeds: Mapping[int, Episodes] = dataclasses.field(default_factory=dict)
     invariance: float | None = None
     made: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    held_out: Mapping[str, Any] | None = None
+    bearings: Sequence[float] | None = None
 
 
 def results(
@@ -64,8 +70,8 @@ def results(
     Returns:
       robot, engine, scale, scenarios, and
       methods: name → `stats.summary`, interactions, replayed, settings, `made` (stage → origin)
-      and, if known, training_seed, invariance and training_seeds (several training seeds:
-      seeds, episodes per seed, `stats.spread`);
+      and, if known, training_seed, invariance, held_out, bearings and training_seeds (several
+      training seeds: seeds, episodes per seed, `stats.spread`);
       paired: "LR-GE" → `stats.paired` of LR against GE and, if both have several training
       seeds in common, `stats.paired_spread` over these;
       other_code: module → digest → methods, for modules whose code differs between rows.
@@ -104,6 +110,9 @@ def _method(row: Row) -> dict[str, Any]:
         record["training_seeds"] = {"seeds": list(runs), "episodes": sizes, **spread}
     if row.invariance is not None:
         record["invariance"] = float(f"{row.invariance:.3g}")
+    for name in ("held_out", "bearings"):
+        if (known := getattr(row, name)) is not None:
+            record[name] = jsonable(known, digits=6)
     if row.made:
         record["made"] = {name: digested(o) for name, o in row.made.items()}
     return record

@@ -18,6 +18,7 @@ from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import Scenarios
 from genidm.offline.methods import EXTENDED
+from genidm.paper.held_out import FILE
 from genidm.paper.methods import ORDER
 from genidm.report.rows import Row, origin
 from genidm.robots import Robot
@@ -62,6 +63,13 @@ class Tested:
         return {stage.directory.name: origin(stage.code, stage.made) for stage in there}
 
     @property
+    def held_out(self) -> dict[str, Any] | None:
+        """Error of the fit by bearing and heading (`genidm.paper.held_out.HeldOut`), or None."""
+        path = self.controller.with_name(FILE)
+        found: dict[str, Any] | None = files.load_json(path) if path.exists() else None
+        return found
+
+    @property
     def controller(self) -> Path:
         """Path of the tested controller."""
         return self.directory.parent / self.summary["fit"] / "controller"
@@ -96,6 +104,8 @@ class Runs:
             training_seeds={test.summary["seed"]: test.episodes for test in tests},
             invariance=invariance,
             made=tests[0].made,
+            held_out=tests[0].summary.get("held_out"),
+            bearings=tests[0].summary.get("bearings"),
         )
 
     @property

@@ -35,6 +35,7 @@ class Shown:
       collecting: agent → metrics during collecting.
       learning: method → metrics while its agent learned to reach goals.
       fitting: method → metrics of its fit.
+      held_out: method → the held-out error of its fit (`genidm.paper.held_out.HeldOut`).
       residuals: mode of 𝒢 → its residual (`genidm.paper.generalize.residual`).
       changes: method → change of its actions `[angles, states]` at `ANGLES`; empty if there is
         no record to sample states from.
@@ -47,6 +48,7 @@ class Shown:
     collecting: Curves
     learning: Curves
     fitting: Curves
+    held_out: dict[str, dict[str, Any]]
     residuals: dict[str, dict[str, np.ndarray]]
     changes: dict[str, np.ndarray]
 
@@ -69,6 +71,9 @@ def gather(runs: Runs) -> Shown:
         learning={name: records for name, records in learned.items() if _holds(records, "reached")},
         fitting={
             name: records for name, records in learned.items() if _holds(records, "loss_action")
+        },
+        held_out={
+            name: found for name, tests in runs.found.items() if (found := tests[0].held_out)
         },
         residuals=_residuals(runs),
         changes=_changes(runs),

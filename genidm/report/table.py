@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -107,6 +108,7 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
             "Mean change of the action when robot and goal are rotated together by up to 180° "
             f"(Def. 3): {', '.join(invariance)}."
         )
+    notes += _fits(methods)
     notes += _origins(methods)
     for module, digests in results.get("other_code", {}).items():
         versions = ", ".join(f"{code} in {' '.join(rows)}" for code, rows in digests.items())
@@ -115,6 +117,31 @@ def _notes(results: Mapping[str, Any]) -> list[str]:
     if lost:
         notes.append(f"Diverged episodes, left out of all means: {', '.join(lost)}.")
     return notes
+
+
+def _fits(methods: Mapping[str, Any]) -> Iterator[str]:
+    """Notes on the fits: the error of their actions, and the bearings that they have seen."""
+    errors = [
+        f"{name} {m['held_out']['error']:.2f} ({m['held_out']['shuffled']:.2f})"
+        for name, m in methods.items()
+        if "held_out" in m
+    ]
+    if errors:
+        yield (
+            "Held-out action error of the fits, as a fraction of the actions' variance (in "
+            f"brackets: with d shuffled): {', '.join(errors)}."
+        )
+    ranges = [
+        f"{name} {_degrees(m['bearings'][0])} to {_degrees(m['bearings'][1])}"
+        for name, m in methods.items()
+        if "bearings" in m
+    ]
+    if ranges:
+        yield f"Bearings of 98 % of the d of each fit, from the heading: {', '.join(ranges)}."
+
+
+def _degrees(radians: float) -> str:
+    return f"{round(math.degrees(radians))}°".replace("-", "−")
 
 
 def _origins(methods: Mapping[str, Any]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from genidm.evaluation.invariance import ANGLES
 from genidm.evaluation.scenarios import Scenarios
 from genidm.paper.protocol import TABLE1
 from genidm.report import figures, table
+from genidm.report.held_out_figure import draw_held_out
 from genidm.report.rows import Row, results
 from genidm.report.runs import Runs, find
 from genidm.report.shown import Shown, gather
@@ -115,6 +116,9 @@ def _draw(
     if shown.fitting:
         keys = ["loss_action", "loss_latent"]
         figures.learning_curves(shown.fitting, at("fitting"), keys, "updates")
+    if shown.held_out:
+        ranges = {row.method: row.bearings for row in rows if row.bearings is not None}
+        draw_held_out(shown.held_out, ranges, at("held_out"))
     if shown.changes:
         figures.invariance(shown.changes, ANGLES, at("invariance"))
     if shown.learning:

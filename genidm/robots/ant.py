@@ -52,7 +52,8 @@ class Ant(MujocoRobot):
         return pose
 
     def _layout(self) -> Layout:
-        contact = symmetry.wrenches("contact", self.mirror.bodies)
+        quarter = self.quarter_turn.bodies if self.quarter_turn else None
+        contact = symmetry.wrenches("contact", self.mirror.bodies, quarter)
         return Layout((*super()._layout().fields, contact))
 
     def _observe(self, physics: Physics, contact: jax.Array) -> jax.Array:

@@ -179,6 +179,15 @@ class Robot(abc.ABC):
         """Physics after the world is rotated by `yaw [B]` about the vertical."""
         return jax.tree.map(lambda layout, x: layout.rotate(x, yaw), self.physics, physics)
 
+    @property
+    def can_turn_body(self) -> bool:
+        """Whether the body has four equal sides: its layouts declare a quarter turn."""
+        return self.observation.can_turn and self.action.can_turn
+
+    def turn_body_physics(self, physics: Any) -> Any:
+        """Physics after a quarter turn of the body's own axes: the same motion."""
+        return jax.tree.map(lambda layout, x: layout.turn_body(x), self.physics, physics)
+
     def mirror_physics(self, physics: Any) -> Any:
         """Physics after the reflection y → −y."""
         return jax.tree.map(lambda layout, x: layout.mirror(x), self.physics, physics)

@@ -51,14 +51,14 @@ def load(path: PathLike[str] | str, solver: Solver) -> mujoco.MjSpec:
 
 
 @dataclasses.dataclass(frozen=True)
-class Mirror:
-    """The reflection y → −y of a model, as permutations and signs.
+class Image:
+    """A symmetry of a model, the reflection y → −y or a quarter turn, as permutations and signs.
 
     Attributes:
-      bodies: `[nbody]`, for each body the body at its mirror image.
-      hinges: `[nv − 6]`, for each hinge the hinge at its mirror image.
+      bodies: `[nbody]`, for each body the body at its image.
+      hinges: `[nv − 6]`, for each hinge the hinge at its image.
       signs: `[nv − 6]`, −1 for hinges whose angle and torque change sign, else 1.
-      actuators: `[nu]`, for each actuator the actuator at its mirror image.
+      actuators: `[nu]`, for each actuator the actuator at its image.
       actuator_signs: `[nu]`, −1 for actuators whose torque changes sign, else 1.
     """
 
@@ -69,27 +69,35 @@ class Mirror:
     actuator_signs: list[float]
 
 
-def _partner(points: np.ndarray, i: int) -> int:
-    distance = np.linalg.norm(points - points[i] * [1, -1, 1], axis=-1)
+REFLECTION = np.diag([1.0, -1.0, 1.0])
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _partner(points: np.ndarray, transformation: np.ndarray, i: int) -> int:
+    distance = np.linalg.norm(points - transformation @ points[i], axis=-1)
     if distance.min() > 1e-6:
-        raise ValueError("the model is not its own mirror image")
+        raise ValueError("the model is not its own image")
     return int(distance.argmin())
 
 
-def mirror_of(model: mujoco.MjModel) -> Mirror:
-    """Finds the mirror image of every body, hinge and actuator in the rest pose.
+def image_of(model: mujoco.MjModel, transformation: np.ndarray) -> Image:
+    """Finds the image of every body, hinge and actuator in the rest pose.
+
+    Args:
+      model: the model.
+      transformation: `[3, 3]`, `REFLECTION` or `QUARTER_TURN`.
 
     Raises:
-      ValueError: the model is not symmetric in the plane y = 0.
+      ValueError: the model is not its own image.
     """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     # Centres of mass tell bodies apart even where their frames coincide.
-    bodies = [_partner(data.xipos, i) for i in range(model.nbody)]
+    bodies = [_partner(data.xipos, transformation, i) for i in range(model.nbody)]
     hinges, signs = [], []
     for j in range(1, model.njnt):
-        # A hinge's axis is a pseudovector: the reflection negates its x and z, and keeps its y.
-        axis = data.xaxis[j] * [-1, 1, -1]
+        # A hinge's axis is a pseudovector.
+        axis = np.linalg.det(transformation) * transformation @ data.xaxis[j]
         body = bodies[model.jnt_bodyid[j]]
         along = [
             (k, axis @ data.xaxis[k]) for k in range(1, model.njnt) if model.jnt_bodyid[k] == body
@@ -99,7 +107,18 @@ def mirror_of(model: mujoco.MjModel) -> Mirror:
         signs.append(float(round(sign)))
     driven = [int(j) - 1 for j in model.actuator_trnid[:, 0]]
     actuators = [driven.index(hinges[j]) for j in driven]
-    return Mirror(bodies, hinges, signs, actuators, [signs[j] for j in driven])
+    return Image(bodies, hinges, signs, actuators, [signs[j] for j in driven])
+
+
+def quarter_turn_of(model: mujoco.MjModel) -> Image | None:
+    """The quarter turn of a model's body, or None if it is not its own image, limits included."""
+    try:
+        image = image_of(model, QUARTER_TURN)
+    except (ValueError, IndexError):
+        return None
+    limits, signs = model.jnt_range[1:], np.array(image.signs)[:, None]
+    same = np.sort(limits[image.hinges] * signs, axis=1)
+    return image if np.allclose(same, limits, atol=1e-6) and signs.all() else None
 
 
 class MujocoRobot(Robot):
@@ -148,12 +167,15 @@ class MujocoRobot(Robot):
         self.engine = engines.of_model(chosen, self._spec, self.frame_skip)
         self.settings = {"name": self.name, "engine": self.engine.name, "solver": solver}
         self._rest = self.rest_pose()
-        self.mirror = mirror_of(self.mj_model)
+        self.mirror = image_of(self.mj_model, REFLECTION)
+        self.quarter_turn = quarter_turn_of(self.mj_model)
         self.physics = self._physics_layout()
         self.observation = self._layout()
         m = self.mirror
+        turn = self.quarter_turn
+        quarter = (turn.actuators, turn.actuator_signs) if turn else None
         self.action = Layout(
-            (symmetry.joints("torque", m.actuators, m.actuator_signs, "of full torque"),)
+            (symmetry.joints("torque", m.actuators, m.actuator_signs, "of full torque", quarter),)
         )
 
     def _specify(self, solver: Solver) -> mujoco.MjSpec:
@@ -166,22 +188,26 @@ class MujocoRobot(Robot):
 
     def _layout(self) -> Layout:
         """Layout of s, as `_observe` returns it."""
-        m = self.mirror
         return Layout(
             (
                 symmetry.invariant("height", unit="m"),
                 symmetry.quaternion("orientation"),
-                symmetry.joints("joint angles", m.hinges, m.signs, "rad"),
+                self._hinges("joint angles", "rad"),
                 symmetry.vector("velocity", "m/s"),
                 symmetry.body_pseudovector("spin"),
-                symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s"),
+                self._hinges("joint velocities", "rad/s"),
             )
         )
 
+    def _hinges(self, name: str, unit: str) -> symmetry.Field:
+        """A field with one number per hinge."""
+        m, turn = self.mirror, self.quarter_turn
+        quarter = (turn.hinges, turn.signs) if turn else None
+        return symmetry.joints(name, m.hinges, m.signs, unit, quarter)
+
     def _physics_layout(self) -> Physics:
-        m = self.mirror
-        angles = symmetry.joints("joint angles", m.hinges, m.signs, "rad")
-        rates = symmetry.joints("joint velocities", m.hinges, m.signs, "rad/s")
+        angles = self._hinges("joint angles", "rad")
+        rates = self._hinges("joint velocities", "rad/s")
         pose = (symmetry.vector("position"), symmetry.quaternion("orientation"), angles)
         motion = (symmetry.vector("velocity", "m/s"), symmetry.body_pseudovector("spin"), rates)
         return Physics(Layout(pose), Layout(motion), Layout(motion))

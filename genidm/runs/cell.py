@@ -13,18 +13,21 @@ from genidm.errors import BadInput
 from genidm.evaluation.evaluate import ControllerFn
 from genidm.evaluation.scenarios import Scenarios, scenarios
 from genidm.offline.methods import AnyMethod, OfflineGoalConditioned
-from genidm.paper.methods import GoalConditioned, InverseDynamics
+from genidm.paper.methods import AgentTurned, GoalConditioned, InverseDynamics
 from genidm.robots import Robot, by_name
+from genidm.runs.fitting import InverseDynamicsRun
 from genidm.runs.offline import OfflineRun
+from genidm.runs.policies import AgentTurnedRun, GoalConditionedRun
 from genidm.runs.resolve import Options, resolve, who_set_what
-from genidm.runs.run import GoalConditionedRun, InverseDynamicsRun, Run
+from genidm.runs.run import Run
 from genidm.runs.scale import scale_of
 from genidm.store import Stage
 
-# Kind of method → its run.
-KINDS: dict[type, Any] = {
-    GoalConditioned: GoalConditionedRun,
+# Type of method → type of its run.
+RUNS: dict[type[Any], Any] = {
     InverseDynamics: InverseDynamicsRun,
+    GoalConditioned: GoalConditionedRun,
+    AgentTurned: AgentTurnedRun,
     OfflineGoalConditioned: OfflineRun,
 }
 
@@ -32,7 +35,7 @@ KINDS: dict[type, Any] = {
 def make_run(robot: Robot, method: AnyMethod, options: Options) -> Run[Any]:
     """Makes the run of a method, with its settings adapted to scale and machine (`resolve`)."""
     chosen = resolve(robot, method, options)
-    return make_exact_run(robot, chosen, options, who_set_what(method, chosen, chosen))
+    return make_exact_run(robot, chosen, options, who_set_what(robot, method, chosen, chosen))
 
 
 def make_exact_run(
@@ -62,9 +65,7 @@ def make_exact_run(
         root=options.run_dir / robot.name, test=options.test,
         notes=notes, other_code=options.other_code,
     )  # fmt: skip
-    kind = next(run for of, run in KINDS.items() if isinstance(method, of))
-    made: Run[Any] = kind(method=method, **given)
-    return made
+    return RUNS[type(method)](method=method, **given)
 
 
 def run_method(robot: Robot, method: AnyMethod, options: Options) -> Path:

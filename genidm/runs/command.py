@@ -38,7 +38,7 @@ def main(robot: Callable[..., Robot], method: AnyMethod) -> None:
         made = robot(**({} if early.engine is None else {"engine": early.engine}))
         chosen = resolve(made, method, early)
         options, given = _parse(_settings(chosen), description)
-        this = make_exact_run(made, given, options, who_set_what(method, chosen, given))
+        this = make_exact_run(made, given, options, who_set_what(made, method, chosen, given))
         report = execute(this, options)
         print((report / "table.txt").read_text(encoding="utf-8"))
 

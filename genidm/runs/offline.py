@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from genidm.experience import Experience
 from genidm.offline.data import dataset
 from genidm.offline.methods import OfflineGoalConditioned
 from genidm.offline.policy import GoalPolicy
 from genidm.offline.train import train
-from genidm.runs.run import RecordRun
+from genidm.runs.fitting import FittingRun
 
 
 @dataclasses.dataclass(frozen=True)
-class OfflineRun(RecordRun[OfflineGoalConditioned]):
+class OfflineRun(FittingRun[OfflineGoalConditioned]):
     """The run of a method that trains an offline learner on experience.
 
     Its record and its 𝒢 are stages that it shares with the paper's methods.
@@ -22,6 +22,7 @@ class OfflineRun(RecordRun[OfflineGoalConditioned]):
 
     made_by: ClassVar[tuple[str, ...]] = ("genidm.offline.train", "genidm.offline.data")
 
-    def fitted(self, record: Experience) -> GoalPolicy:
+    def fit(self, record: Experience) -> tuple[GoalPolicy, dict[str, Any]]:
         data = dataset(self.robot, record, self.replay(record))
-        return train(data, self.fit_key, self.method.learner, stage=self.controller_stage)
+        policy = train(data, self.fit_key, self.method.learner, stage=self.controller_stage)
+        return policy, {"longest_goal": float(policy.longest_goal)}

@@ -72,7 +72,7 @@ def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
     if options.paper_settings:
         if not isinstance(method, InverseDynamics):
             raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
-        method = paper_settings(method)
+        method = paper_settings(method, robot.name)
     if isinstance(method, InverseDynamics | OfflineGoalConditioned):
         if method.generalize:
             method = dataclasses.replace(method, generalize=method.generalize.on(robot))
@@ -96,7 +96,9 @@ def _fitting(method: InverseDynamics | OfflineGoalConditioned, scale: Scale) -> 
         agent = dataclasses.replace(
             agent, fraction=max(agent.fraction, scale.min_learning_fraction)
         )
-    changes: dict[str, Any] = dict(agent=agent, fraction=max(method.fraction, scale.fraction))
+    # The scale asks for the whole record in place of its first half, not of its last.
+    fraction = method.fraction if method.skip else max(method.fraction, scale.fraction)
+    changes: dict[str, Any] = dict(agent=agent, fraction=fraction)
     if isinstance(method, InverseDynamics):
         changes["goal_horizon"] = min(method.goal_horizon, scale.goal_horizon)
         changes["fit"] = _fewer_updates(method.fit, scale)
@@ -110,13 +112,12 @@ def _fewer_updates(settings: Any, scale: Scale) -> Any:
 
 
 def who_set_what(
-    method: AnyMethod,
-    chosen: AnyMethod,
-    given: AnyMethod,
+    robot: Robot, method: AnyMethod, chosen: AnyMethod, given: AnyMethod
 ) -> tuple[str, ...]:
     """Says which settings of a run differ from the method's defaults or from the paper, and why.
 
     Args:
+      robot: the robot.
       method: the method with its defaults for the robot.
       chosen: the method adapted to scale, engine and machine (`resolve`).
       given: the method as it runs.
@@ -125,7 +126,7 @@ def who_set_what(
       up to three lines: settings that `resolve` chose, that the user set, and that differ from
       the paper.
     """
-    papers = paper_settings(given) if isinstance(given, InverseDynamics) else given
+    papers = paper_settings(given, robot.name) if isinstance(given, InverseDynamics) else given
     lines = []
     for origin, before, after in (
         ("chosen for this scale and machine", method, chosen),

@@ -1,66 +1,47 @@
-"""The stages of a run (one cell of Table 1); a finished stage is skipped.
+"""The stages of a run (one cell of Table 1), and its test; a finished stage is skipped.
 
-    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        FromRecord methods
+    [agent ──▶] experience ──▶ replay (𝒢) ──▶ controller ──▶ test        InverseDynamics methods
+                experience ──────────────────▶ policy ──────▶ test        AgentTurned
                                               policy ──────▶ test        GoalConditioned methods
 
 The name of a stage's directory contains a hash of all settings that the stage depends on:
-methods with equal settings share a stage, and a killed run resumes.
+methods with equal settings share a stage, and a killed run resumes. The stages before the test
+are in `recording` (agent, experience), `fitting` (replay, controller) and `goals` (policy).
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
-from genidm import controller, experience, files
-from genidm.agents.base import Agent
-from genidm.agents.collect import collect, whole
-from genidm.agents.frozen import Acting, Frozen
-from genidm.agents.policy import Policy
+from genidm import files
 from genidm.config import to_json
-from genidm.controller import Controller
 from genidm.errors import BadInput
 from genidm.evaluation import sanity
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.evaluate import ControllerFn, EvaluationSettings, episodes, flatten, run
 from genidm.evaluation.scenarios import Scenarios, fig8_scenarios
-from genidm.experience import Experience
-from genidm.paper.fit import fit
-from genidm.paper.generalize import replay, residual
-from genidm.paper.methods import FromRecord, GoalConditioned, InverseDynamics, Method
-from genidm.paper.pairs import pairs
-from genidm.paper.replaying import RotatedReplay
+from genidm.paper.methods import Method
 from genidm.provenance import code_of
 from genidm.robots import Robot, State
 from genidm.runs.scale import Scale
 from genidm.store import Stage
 
 M = TypeVar("M", bound=Method)
-R = TypeVar("R", bound=FromRecord)
 
 # Test episodes that are recorded for rendering.
 RECORDED_EPISODES = 3
-# Module that makes a record, besides the agent's own.
-COLLECT = "genidm.agents.collect"
 # Modules of the test, besides the robot and its engine.
 TEST = (
     *("genidm.evaluation.evaluate", "genidm.evaluation.scenarios", "genidm.evaluation.sanity"),
     "genidm.controller",
 )
-
-
-class SavedController(Protocol):
-    """What a fit makes: a controller that `controller.load` reads."""
-
-    def save(self, path: Path | str, overwrite: bool = False) -> None:
-        """Write the controller as a directory."""
 
 
 class Trace(NamedTuple):
@@ -123,10 +104,17 @@ class Run(abc.ABC, Generic[M]):
     def sources(self) -> list[Stage]:
         """The stages that lead to the controller; the controller's own is the last."""
 
-    def _stage(self, name: str, config: dict[str, Any], *code: Any) -> Stage:
-        """The stage of a config; it depends on this module, the robot, its engine and `code`."""
-        # This module imports all stages; a stage depends only on the code of its own.
-        made_by = code_of(self.robot, self.robot.engine, config, *code, alone=[__name__])
+    def _stage(self, name: str, config: dict[str, Any], module: str, *code: Any) -> Stage:
+        """The stage of a config.
+
+        Args:
+          name: first part of the directory's name.
+          config: the settings that the stage depends on, besides robot and seed.
+          module: the module that defines the stage. It imports more than the stage needs, so only
+            its own code counts.
+          code: other code that the stage depends on, besides robot, engine and `config`.
+        """
+        made_by = code_of(self.robot, self.robot.engine, config, *code, alone=[module])
         config = {"robot": self.robot.settings, "seed": self.seed} | config
         return Stage.open(self.root, name, config, made_by, self.other_code)
 
@@ -136,20 +124,6 @@ class Run(abc.ABC, Generic[M]):
 
     def _key(self, stage: int) -> jax.Array:
         return jax.random.fold_in(jax.random.key(self.seed), stage)
-
-    def _learning(self, agent: Any, interactions: int) -> dict[str, Any]:
-        """The config of a stage in which an agent collects or learns."""
-        return {"agent": agent, "task": self.method.task, "interactions": interactions}
-
-    def _collect(
-        self, stage: Stage, agent: Agent, interactions: int, keep: bool = True
-    ) -> tuple[Any, Policy | None]:
-        """Runs an agent; returns its record (if `keep`) and its final policy, if it has one."""
-        task = self.method.task
-        record, learner = collect(
-            self.robot, agent, interactions, self.seed, task=task, stage=stage, keep=keep
-        )
-        return record, agent.policy(self.robot, task, learner)
 
     def test_stage(self, scenarios: Scenarios, kind: str = "test") -> Stage:
         """The stage of the test on some scenarios.
@@ -161,7 +135,7 @@ class Run(abc.ABC, Generic[M]):
         """
         source = self.controller_stage.directory.name
         config = {"fit": source, "scenarios": scenarios.digest(), "test": self.test}
-        return self._stage(f"{kind}-{self._label}", config, *TEST)
+        return self._stage(f"{kind}-{self._label}", config, __name__, *TEST)
 
     def run_test(self, scenarios: Scenarios, kind: str = "test") -> Stage:
         """Runs the test (A.1.3) and the episodes of Fig. 8; returns the finished `test_stage`."""
@@ -206,203 +180,6 @@ class Run(abc.ABC, Generic[M]):
             {"qpos": qpos, "position": np.asarray(trace.position), "target": np.asarray(at)}
             for qpos, trace, at in zip(poses, traces, target, strict=False)
         ]
-
-
-@dataclasses.dataclass(frozen=True)
-class RecordRun(Run[R]):
-    """The run of a method that learns a controller from a record of experience.
-
-    Attributes:
-      repeat: number of an independent fit to the same record; 0 is the method's own fit.
-      made_by: modules that make the controller.
-    """
-
-    repeat: int = 0
-    made_by: ClassVar[tuple[str, ...]] = ()
-
-    @abc.abstractmethod
-    def fitted(self, record: Experience) -> SavedController:
-        """The controller that learns from `record`, with the `replay` of it."""
-
-    @functools.cached_property
-    def experience_stage(self) -> Stage:
-        """The stage of the record; methods with the same agent share it."""
-        agent = self.method.agent
-        config = self._learning(agent, self.scale.interactions)
-        return self._stage(f"experience-{type(agent).__name__}-{self.seed}", config, COLLECT)
-
-    def experience(self) -> Experience:
-        """The record E of the agent (§4.1); collected if its stage is not finished."""
-        stage, made = self.experience_stage, list[Experience]()
-        stage.run_once(lambda: self._collected(made))
-        if made:
-            return made[0]
-        recorded = stage.summary()["recorded"]
-        return stage.read(experience.load_chunks, "experience", self.robot, recorded)
-
-    def _collected(self, made: list[Experience]) -> dict[str, Any]:
-        """Collects, and appends the record to `made`, so that it is not read from disk again."""
-        stage, (agent, before) = self.experience_stage, self._collector()
-        record, policy = self._collect(stage, agent, self.scale.interactions - before)
-        if policy:
-            policy.save(stage.path("policy"), overwrite=True)
-        made.append(record)
-        recorded = record.interactions
-        return {"interactions": before + recorded, "recorded": recorded}
-
-    @functools.cached_property
-    def agent_stage(self) -> Stage | None:
-        """The stage of the policy that is frozen and then collects; None for other agents."""
-        frozen = self.method.agent
-        if not isinstance(frozen, Frozen):
-            return None
-        config = self._learning(frozen.agent, self._before(frozen))
-        return self._stage(f"agent-{type(frozen.agent).__name__}-{self.seed}", config, COLLECT)
-
-    def _before(self, frozen: Frozen) -> int:
-        """Interactions after which the agent is frozen."""
-        return whole(frozen.agent, round(frozen.fraction * self.scale.interactions))
-
-    def _collector(self) -> tuple[Agent, int]:
-        """The agent that collects, and the interactions in which it has learned before."""
-        frozen, stage = self.method.agent, self.agent_stage
-        if not isinstance(frozen, Frozen):
-            return frozen, 0
-        assert stage
-        interactions = self._before(frozen)
-
-        def work() -> dict[str, Any]:
-            _, policy = self._collect(stage, frozen.agent, interactions, keep=False)
-            assert policy  # every agent that can be frozen has a policy
-            policy.save(stage.path("policy"), overwrite=True)
-            return {"interactions": interactions}
-
-        stage.run_once(work)
-        learned = stage.read(controller.load, "policy", self.robot)
-        assert isinstance(learned, Policy)
-        return Acting(frozen.agent, learned), interactions
-
-    @functools.cached_property
-    def replay_stage(self) -> Stage | None:
-        """The stage of 𝒢(E); None for a method that learns from the record alone."""
-        m = self.method
-        if m.generalize is None:
-            return None
-        source = self.experience_stage.directory.name
-        config = {"experience": source, "fraction": m.fraction, "generalize": m.generalize}
-        name = f"replay-{m.generalize.mode}-{self.seed}"
-        return self._stage(name, config, "genidm.paper.generalize")
-
-    def replay(self, record: Experience) -> RotatedReplay | None:
-        """𝒢(E) (Def. 4) of `record`, the part that the method learns from; None without 𝒢."""
-        stage = self.replay_stage
-        if stage is None:
-            return None
-
-        def work() -> dict[str, Any]:
-            replayed = replay(self.robot, record, self._key(1), self.method.generalize)
-            replayed.save(stage.path("replay"))
-            errors = residual(record, replayed)
-            files.save_arrays(stage.path("residual"), errors, {}, overwrite=True)
-            return {"replayed": replayed.yaw.size}
-
-        stage.run_once(work)
-        return stage.read(RotatedReplay.load, "replay")
-
-    @functools.cached_property
-    def controller_stage(self) -> Stage:
-        """The stage of the fitted controller."""
-        source = self.replay_stage or self.experience_stage
-        # All fields but those that the source stages contain, so that a new field counts too.
-        config = {f.name: getattr(self.method, f.name) for f in dataclasses.fields(self.method)}
-        for upstream in ("agent", "task"):
-            del config[upstream]
-        config = {"source": source.directory.name, "repeat": self.repeat} | config
-        label = f"{self._label}-fit{self.repeat}" if self.repeat else self._label
-        return self._stage(label, config, *self.made_by)
-
-    @property
-    def sources(self) -> list[Stage]:
-        stages = (self.agent_stage, self.experience_stage, self.replay_stage, self.controller_stage)
-        return [stage for stage in stages if stage]
-
-    @property
-    def fit_key(self) -> jax.Array:
-        """Random key of the fit."""
-        key = self._key(2)
-        return jax.random.fold_in(key, self.repeat) if self.repeat else key
-
-    def controller(self) -> ControllerFn:
-        """The fitted controller; fitted if its stage is not finished."""
-        stage = self.controller_stage
-        stage.run_once(self._fit)
-        return stage.read(controller.load, "controller", self.robot)
-
-    def _fit(self) -> dict[str, Any]:
-        stage, m = self.controller_stage, self.method
-        record = self.experience().first_fraction(m.fraction).prepared(self.robot)
-        self.fitted(record).save(stage.path("controller"), overwrite=True)
-        return {
-            "robot": self.robot.name,
-            "method": m.name,
-            "experience": self.experience_stage.directory.name,
-            "interactions": self._count(self.experience_stage, "interactions"),
-            "learned_from": record.interactions,
-            "replayed": self._count(self.replay_stage, "replayed"),
-            "settings": to_json(m),
-        }
-
-    def _count(self, stage: Stage | None, what: str) -> int:
-        return stage.summary()[what] if stage else 0
-
-
-@dataclasses.dataclass(frozen=True)
-class InverseDynamicsRun(RecordRun[InverseDynamics]):
-    """The run of a method that fits an inverse dynamics model to experience."""
-
-    made_by: ClassVar[tuple[str, ...]] = ("genidm.paper.fit", "genidm.paper.pairs")
-
-    def fitted(self, record: Experience) -> Controller:
-        m, stage = self.method, self.controller_stage
-        samples = pairs(
-            self.robot, record, self.replay(record), goal_horizon=m.goal_horizon, mirror=m.mirror
-        )
-        return fit(self.robot, samples, self.fit_key, m.fit, input_frame=m.input_frame, stage=stage)
-
-
-@dataclasses.dataclass(frozen=True)
-class GoalConditionedRun(Run[GoalConditioned]):
-    """The run of a method whose agent learns to reach goals; its policy is the controller."""
-
-    @functools.cached_property
-    def controller_stage(self) -> Stage:
-        config = self._learning(self.method.agent, self.scale.interactions)
-        return self._stage(self._label, config | {"name": self.method.name}, COLLECT)
-
-    @property
-    def sources(self) -> list[Stage]:
-        return [self.controller_stage]
-
-    def controller(self) -> ControllerFn:
-        """The agent's final policy; learned if its stage is not finished."""
-        stage = self.controller_stage
-        stage.run_once(self._learned)
-        return stage.read(controller.load, "controller", self.robot)
-
-    def _learned(self) -> dict[str, Any]:
-        stage, m = self.controller_stage, self.method
-        _, policy = self._collect(stage, m.agent, self.scale.interactions, keep=False)
-        assert policy  # the agent of every GoalConditioned method learns one
-        policy.save(stage.path("controller"), overwrite=True)
-        interactions = whole(m.agent, self.scale.interactions)
-        return {
-            "robot": self.robot.name,
-            "method": m.name,
-            "interactions": interactions,
-            "learned_from": interactions,
-            "replayed": 0,
-            "settings": to_json(m),
-        }
 
 
 def save_test(

@@ -60,7 +60,7 @@ def scale_of(text: str, interactions: int) -> Scale:
         return Scale(
             "quick",
             400_000,
-            0.1,
+            0.2,
             2,
             50,
             goal_horizon=50,
