@@ -17,7 +17,7 @@ import tyro
 
 from experiments import table1
 from genidm.experience import Experience
-from genidm.paper.methods import AnyMethod
+from genidm.offline.methods import AnyMethod
 from genidm.robots import Humanoid, HumanoidWorld, Robot
 from genidm.runs.cell import make_run
 from genidm.runs.command import run_cli

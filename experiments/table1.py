@@ -15,7 +15,8 @@ import tyro
 from genidm.checks import check, count
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
-from genidm.paper.methods import EXTRA, ORDER, AnyMethod, by_name
+from genidm.offline.methods import AnyMethod, by_name
+from genidm.paper.methods import EXTRA, ORDER
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
 from genidm.runs.cell import announce, make_run, render_run, scenarios_of, write_report

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from genidm.errors import BadInput
+from genidm.offline.methods import EXTENDED, by_name
 from genidm.paper import methods
 from genidm.robots import ROBOTS
 from genidm.runs import command
@@ -37,7 +38,8 @@ def named(arguments: Sequence[str]) -> tuple[str | None, str | None, list[str]]:
 def choices(robot: str | None) -> str:
     """Text that lists all robots, and the methods of `robot`."""
     of = methods.TABLES.get(robot or "", methods.ANT)
-    return f"robots: {', '.join(ROBOTS)}; methods: {', '.join(method.name for method in of)}"
+    names = (*(method.name for method in of), *EXTENDED)
+    return f"robots: {', '.join(ROBOTS)}; methods: {', '.join(names)}"
 
 
 def main() -> None:
@@ -51,7 +53,7 @@ def main() -> None:
             raise BadInput(f"give --robot and --method; {choices(robot)}")
         if robot not in ROBOTS:
             raise BadInput(f"no robot is called {robot!r}; {choices(None)}")
-        chosen = methods.by_name(method, robot)
+        chosen = by_name(method, robot)
     sys.argv[1:] = rest
     command.main(ROBOTS[robot], chosen)
 

@@ -15,6 +15,7 @@ from genidm.agents.policy import Policy, bearing, described
 from genidm.checks import WIDEST, check_value, count, layers, one_of, optional, shown
 from genidm.config import to_json
 from genidm.errors import BadInput
+from genidm.offline.policy import GoalPolicy
 from genidm.paper.idm import NETWORKS, Architecture
 from genidm.robots import Robot, by_name
 from genidm.symmetry import quarters_to
@@ -193,7 +194,15 @@ class Controller(flax.struct.PyTreeNode):
         )
 
 
-def pretrained(robot: str) -> Controller | Policy:
+# Field that a kind of controller alone has in its metadata → the kind.
+KINDS: dict[str, type[Controller] | type[Policy] | type[GoalPolicy]] = {
+    "goal_conditioned": Policy,
+    "longest_goal": GoalPolicy,
+    "input_frame": Controller,
+}
+
+
+def pretrained(robot: str) -> Controller | Policy | GoalPolicy:
     """Load the pretrained controller of a robot, the best one in our experiments.
 
     Its directory, `genidm/pretrained/ROBOT`, is that of its run and holds its settings.
@@ -212,12 +221,12 @@ def pretrained(robot: str) -> Controller | Policy:
 
 def load(
     path: Path | str, robot: Robot | None = None, engine: str | None = None
-) -> Controller | Policy:
-    """Load a saved controller: a fitted Controller, or the Policy of a baseline.
+) -> Controller | Policy | GoalPolicy:
+    """Load a saved controller: a fitted Controller, or the policy of a baseline.
 
     Args:
-      path: directory that `Controller.save` or `Policy.save` wrote, or the directory of its
-        run (METHOD-SEED-…).
+      path: directory that a controller's `save` wrote, or the directory of its run
+        (METHOD-SEED-…).
       robot: robot of the controller; None finds a registered robot by its name.
       engine: engine of the robot if `robot` is None; None takes the robot's default.
 
@@ -239,11 +248,11 @@ def load(
     if made_for != robot.name:
         raise BadInput(f"{path} holds a controller for {shown(made_for)}, not for {robot.name}")
     _same_layouts(path, meta, robot)
-    if not {"goal_conditioned", "input_frame"} & meta.keys():
+    kinds = [kind for field, kind in KINDS.items() if field in meta]
+    if not kinds:
         raise BadInput(f"{path} was made by an older version of genidm: make it again")
-    restore = Policy.restore if "goal_conditioned" in meta else Controller.restore
     try:
-        made = restore(tree, meta, robot)
+        made = kinds[0].restore(tree, meta, robot)
         wanted = jax.eval_shape(made.fresh, jax.random.key(0))
     except (BadInput, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise BadInput(f"{path} holds no controller: {shown(error)}") from None

@@ -18,7 +18,7 @@ ORDER = """
 errors evaluation.episodes quiet paper.protocol
 checks devices registry trees renamed
 symmetry
-evaluation paper runs
+evaluation offline paper runs
 config
 files
 checkpoints progress provenance
@@ -44,7 +44,10 @@ agents
 agents.collect
 paper.replaying
 paper.pairs
-paper.generalize paper.idm
+paper.generalize paper.idm offline.networks offline.data
+offline.policy offline.learner
+offline.gcbc offline.implicit offline.crl
+offline.gcivl offline.hiql
 controller
 paper.fit
 paper.held_out
@@ -57,12 +60,13 @@ report.rows
 report.table report.drawing
 report.figures report.waypoint_figure report.held_out_figure
 report
-paper.methods
-paper.author
+paper.methods offline.train
+paper.author offline.methods
 runs.scale
 runs.resolve runs.run
 runs.recording
 runs.fitting runs.policies
+runs.offline
 report.runs
 report.shown
 report.write

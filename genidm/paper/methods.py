@@ -55,46 +55,59 @@ class GoalConditioned(Method):
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseDynamics(Method):
-    """Inverse dynamics (§4): a controller fitted to experience without goals.
+class FromRecord(Method):
+    """A method that learns a controller from a record of experience without goals.
 
     Attributes:
       fraction: fraction of the record to learn from. For the paper's GE and LR, 𝒢 makes the
         other half (A.1.2).
+      generalize: settings of 𝒢; None learns from the record only.
       skip: fraction of the record to leave out before that part; 0 takes the first part, as the
         paper does, and 1 − fraction the last.
-      labels: the recorded actions to learn: "performed" (the paper's), or "intended", the agent's
-        choice before exploration.
-      generalize: settings of 𝒢; None learns from the record only.
+    """
+
+    fraction: float
+    generalize: Generalize | None
+    skip: float = dataclasses.field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, fraction=positive(1), skip=number(0, 1))
+        if self.fraction + self.skip > 1 + 1e-9:
+            raise BadInput(
+                f"skip {self.skip:g} and fraction {self.fraction:g} are more than the record"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseDynamics(FromRecord):
+    """Inverse dynamics (§4): a controller fitted to experience without goals.
+
+    Attributes:
       goal_horizon: h, steps to the intermediate goal o' (Def. 1); 1 is the paper's "next
         position". Steps whose episode ends earlier are left out.
       mirror: add the reflection of every sample; not in the paper.
       input_frame: "heading" rotates every input so that the robot faces +x; not in the paper.
       fit: networks and losses.
+      labels: the recorded actions to learn: "performed" (the paper's), or "intended", the agent's
+        choice before exploration.
       clip_bearing: at run time, rotate d into the range of bearings of the samples where it lies
         outside (`Controller.bearings`); not in the paper.
       nearest_side: count the side of the body that is nearest to d as its front, for a body with
         four equal sides; not in the paper.
     """
 
-    fraction: float
-    generalize: Generalize | None
     goal_horizon: int
     mirror: bool
     input_frame: Frame
     fit: Fit
-    skip: float = 0.0
     labels: Labels = "performed"
     clip_bearing: bool = False
     nearest_side: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, fraction=positive(1), skip=number(0, 1), goal_horizon=count())
-        if self.fraction + self.skip > 1 + 1e-9:
-            raise BadInput(
-                f"skip {self.skip:g} and fraction {self.fraction:g} are more than the record"
-            )
+        check(self, goal_horizon=count())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ from genidm.errors import BadInput
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.evaluate import EvaluationSettings
 from genidm.evaluation.scenarios import Scenarios
+from genidm.offline.methods import EXTENDED
 from genidm.paper.held_out import FILE
 from genidm.paper.methods import ORDER
 from genidm.report.rows import Row, origin
@@ -184,7 +185,8 @@ def _by_method(done: Iterator[Tested], digest: str) -> dict[str, list[Tested]]:
             _warn_of_another(kept, test)
             seeds[test.summary["seed"]] = test
     rows = {}
-    for name in sorted(newest, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n)):
+    known = (*ORDER, *EXTENDED)
+    for name in sorted(newest, key=lambda n: (known.index(n) if n in known else len(known), n)):
         order = sorted(
             newest[name].values(),
             key=lambda t: (t.summary["scenarios"] != digest, t.summary["seed"]),

@@ -12,9 +12,11 @@ from genidm.checks import shown
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import ControllerFn
 from genidm.evaluation.scenarios import Scenarios, scenarios
-from genidm.paper.methods import AgentTurned, AnyMethod, GoalConditioned, InverseDynamics
+from genidm.offline.methods import AnyMethod, OfflineGoalConditioned
+from genidm.paper.methods import AgentTurned, GoalConditioned, InverseDynamics
 from genidm.robots import Robot, by_name
 from genidm.runs.fitting import InverseDynamicsRun
+from genidm.runs.offline import OfflineRun
 from genidm.runs.policies import AgentTurnedRun, GoalConditionedRun
 from genidm.runs.resolve import Options, resolve, who_set_what
 from genidm.runs.run import Run
@@ -26,6 +28,7 @@ RUNS: dict[type[Any], Any] = {
     InverseDynamics: InverseDynamicsRun,
     GoalConditioned: GoalConditionedRun,
     AgentTurned: AgentTurnedRun,
+    OfflineGoalConditioned: OfflineRun,
 }
 
 

@@ -16,7 +16,7 @@ import tyro
 from genidm import devices
 from genidm.checkpoints import requested_seconds
 from genidm.errors import BadInput, sentence
-from genidm.paper.methods import AnyMethod
+from genidm.offline.methods import AnyMethod
 from genidm.renamed import refuse
 from genidm.robots import Robot
 from genidm.runs.cell import execute, make_exact_run

@@ -1,11 +1,13 @@
-"""The stages of a run that fits: 𝒢 and the inverse dynamics model."""
+"""The stages of a run that fits: 𝒢, and the controller that learns from the record."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 import sys
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import jax
 from tqdm.auto import tqdm
@@ -18,22 +20,41 @@ from genidm.experience import Experience
 from genidm.paper.fit import fit
 from genidm.paper.generalize import replay, residual
 from genidm.paper.held_out import FILE, held_out_error
-from genidm.paper.methods import InverseDynamics
+from genidm.paper.methods import FromRecord, InverseDynamics
 from genidm.paper.pairs import Pairs, split_pairs
 from genidm.paper.replaying import RotatedReplay
 from genidm.runs.recording import RecordingRun
 from genidm.store import Stage
 
+R = TypeVar("R", bound=FromRecord)
+
+
+class Saved(Protocol):
+    """What a fit makes: a controller that `controller.load` reads."""
+
+    def save(self, path: Path | str, overwrite: bool = False) -> None:
+        """Write the controller as a directory."""
+
 
 @dataclasses.dataclass(frozen=True)
-class InverseDynamicsRun(RecordingRun[InverseDynamics]):
-    """The run of a method that fits an inverse dynamics model to experience.
+class FittingRun(RecordingRun[R]):
+    """The run of a method that learns a controller from a record of experience.
 
     Attributes:
-      repeat: number of an independent fit to the same pairs; 0 is the method's own fit.
+      repeat: number of an independent fit to the same record; 0 is the method's own fit.
+      made_by: modules that make the controller.
     """
 
     repeat: int = 0
+    made_by: ClassVar[tuple[str, ...]] = ()
+
+    @abc.abstractmethod
+    def fit(self, record: Experience) -> tuple[Saved, dict[str, Any]]:
+        """Learns a controller from the method's part of the record, and from `replay` of it.
+
+        Returns:
+          the controller, and what the stage's summary says of it.
+        """
 
     @functools.cached_property
     def replay_stage(self) -> Stage | None:
@@ -73,7 +94,7 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
             del config[upstream]
         config = {"source": source.directory.name, "repeat": self.repeat} | config
         label = f"{self._label}-fit{self.repeat}" if self.repeat else self._label
-        return self._stage(label, config, __name__, "genidm.paper.fit", "genidm.paper.held_out")
+        return self._stage(label, config, __name__, *self.made_by)
 
     @property
     def sources(self) -> list[Stage]:
@@ -81,12 +102,13 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
         return [stage for stage in stages if stage]
 
     @property
-    def _fit_key(self) -> jax.Array:
+    def fit_key(self) -> jax.Array:
+        """Random key of the fit."""
         key = self._key(2)
         return jax.random.fold_in(key, self.repeat) if self.repeat else key
 
     def controller(self) -> ControllerFn:
-        """The fitted models; fitted if their stage is not finished."""
+        """The fitted controller; fitted if its stage is not finished."""
         stage = self.controller_stage
         stage.run_once(self._fitted)
         return stage.read(controller.load, "controller", self.robot)
@@ -94,14 +116,7 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
     def _fitted(self) -> dict[str, Any]:
         stage, m = self.controller_stage, self.method
         record = self.experience().part(m.fraction, m.skip).prepared(self.robot)
-        samples, held_out = split_pairs(
-            self.robot, record, self.replay(record),
-            goal_horizon=m.goal_horizon, mirror=m.mirror, labels=m.labels,
-            nearest_side=m.nearest_side,
-        )  # fmt: skip
-        model = fit(
-            self.robot, samples, self._fit_key, m.fit, input_frame=m.input_frame, stage=stage
-        ).replace(clip_bearing=m.clip_bearing, nearest_side=m.nearest_side)
+        model, found = self.fit(record)
         model.save(stage.path("controller"), overwrite=True)
         return {
             "robot": self.robot.name,
@@ -111,6 +126,30 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
             "learned_from": record.interactions,
             "replayed": self._count(self.replay_stage, "replayed"),
             "settings": to_json(m),
+            **found,
+        }
+
+    def _count(self, stage: Stage | None, what: str) -> int:
+        return stage.summary()[what] if stage else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseDynamicsRun(FittingRun[InverseDynamics]):
+    """The run of a method that fits an inverse dynamics model to experience."""
+
+    made_by: ClassVar[tuple[str, ...]] = ("genidm.paper.fit", "genidm.paper.held_out")
+
+    def fit(self, record: Experience) -> tuple[Controller, dict[str, Any]]:
+        m, stage = self.method, self.controller_stage
+        samples, held_out = split_pairs(
+            self.robot, record, self.replay(record),
+            goal_horizon=m.goal_horizon, mirror=m.mirror, labels=m.labels,
+            nearest_side=m.nearest_side,
+        )  # fmt: skip
+        model = fit(
+            self.robot, samples, self.fit_key, m.fit, input_frame=m.input_frame, stage=stage
+        ).replace(clip_bearing=m.clip_bearing, nearest_side=m.nearest_side)
+        return model, {
             "bearings": to_json(model.bearings),
             "held_out": self._judged(model, samples, held_out),
         }
@@ -123,6 +162,3 @@ class InverseDynamicsRun(RecordingRun[InverseDynamics]):
         files.save_json(self.controller_stage.path(FILE), found)
         tqdm.write(f"{self.method.name}: {found}", file=sys.stderr)
         return found.totals
-
-    def _count(self, stage: Stage | None, what: str) -> int:
-        return stage.summary()[what] if stage else 0

@@ -13,7 +13,8 @@ from genidm.checks import check, count, optional
 from genidm.config import flat, to_json
 from genidm.errors import BadInput
 from genidm.evaluation.evaluate import EvaluationSettings
-from genidm.paper.methods import AnyMethod, InverseDynamics, paper_settings
+from genidm.offline.methods import AnyMethod, OfflineGoalConditioned
+from genidm.paper.methods import InverseDynamics, paper_settings
 from genidm.robots import Robot
 from genidm.runs.scale import Scale, scale_of
 
@@ -68,15 +69,14 @@ def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
     agent = _at_scale(method.agent, scale)
     agent = agent if devices.memory() is None else agent.for_accelerator()
     method = dataclasses.replace(method, agent=agent)
-    if not isinstance(method, InverseDynamics):
-        if options.paper_settings:
-            raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
-        return method
     if options.paper_settings:
+        if not isinstance(method, InverseDynamics):
+            raise BadInput(f"--paper-settings changes nothing in {method.name}: leave it out")
         method = paper_settings(method, robot.name)
-    method = _fitting(method, scale)
-    if method.generalize:
-        method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+    if isinstance(method, InverseDynamics | OfflineGoalConditioned):
+        if method.generalize:
+            method = dataclasses.replace(method, generalize=method.generalize.on(robot))
+        return _fitting(method, scale)
     return method
 
 
@@ -88,7 +88,7 @@ def _at_scale(agent: Any, scale: Scale) -> Any:
     return dataclasses.replace(scale.ppo, **kept) if agent == PPO(**kept) else agent
 
 
-def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
+def _fitting(method: InverseDynamics | OfflineGoalConditioned, scale: Scale) -> AnyMethod:
     """Adapts updates, horizon and fractions to the scale's shorter record."""
     agent = method.agent
     if isinstance(agent, Frozen):
@@ -97,14 +97,17 @@ def _fitting(method: InverseDynamics, scale: Scale) -> InverseDynamics:
         )
     # The scale asks for the whole record in place of its first half, not of its last.
     fraction = method.fraction if method.skip else max(method.fraction, scale.fraction)
-    updates = max(1, round(method.fit.updates * scale.updates))
-    return dataclasses.replace(
-        method,
-        agent=agent,
-        goal_horizon=min(method.goal_horizon, scale.goal_horizon),
-        fraction=fraction,
-        fit=dataclasses.replace(method.fit, updates=updates),
-    )
+    changes: dict[str, Any] = dict(agent=agent, fraction=fraction)
+    if isinstance(method, InverseDynamics):
+        changes["goal_horizon"] = min(method.goal_horizon, scale.goal_horizon)
+        changes["fit"] = _fewer_updates(method.fit, scale)
+    else:
+        changes["learner"] = _fewer_updates(method.learner, scale)
+    return dataclasses.replace(method, **changes)
+
+
+def _fewer_updates(settings: Any, scale: Scale) -> Any:
+    return dataclasses.replace(settings, updates=max(1, round(settings.updates * scale.updates)))
 
 
 def who_set_what(
