@@ -81,7 +81,13 @@ def resolve(robot: Robot, method: AnyMethod, options: Options) -> AnyMethod:
 
 
 def _at_scale(agent: Any, scale: Scale) -> Any:
-    """Replaces PPO at default settings by the scale's, keeping layers and mirror; others stay."""
+    """Replaces PPO at default settings by the scale's, keeping layers and mirror; others stay.
+
+    An agent that is frozen learns for at least the scale's fraction of the interactions.
+    """
+    if isinstance(agent, Frozen):
+        fraction = max(agent.fraction, scale.min_learning_fraction)
+        return dataclasses.replace(agent, fraction=fraction)
     if not isinstance(agent, PPO):
         return agent
     kept = {name: getattr(agent, name) for name in ("policy_hidden_layer_sizes", "mirror")}
@@ -90,14 +96,9 @@ def _at_scale(agent: Any, scale: Scale) -> Any:
 
 def _fitting(method: InverseDynamics | OfflineGoalConditioned, scale: Scale) -> AnyMethod:
     """Adapts updates, horizon and fractions to the scale's shorter record."""
-    agent = method.agent
-    if isinstance(agent, Frozen):
-        agent = dataclasses.replace(
-            agent, fraction=max(agent.fraction, scale.min_learning_fraction)
-        )
     # The scale asks for the whole record in place of its first half, not of its last.
     fraction = method.fraction if method.skip else max(method.fraction, scale.fraction)
-    changes: dict[str, Any] = dict(agent=agent, fraction=fraction)
+    changes: dict[str, Any] = dict(fraction=fraction)
     if isinstance(method, InverseDynamics):
         changes["goal_horizon"] = min(method.goal_horizon, scale.goal_horizon)
         changes["fit"] = _fewer_updates(method.fit, scale)
