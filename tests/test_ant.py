@@ -14,9 +14,12 @@ from in_c import assert_close, assert_commutes, placed, positive_w, step_in_c
 from one_step import advance
 from scipy.spatial.transform import Rotation
 
-from genidm import symmetry
+from genidm import controller, symmetry
+from genidm.controller import Controller
 from genidm.engines import Physics
 from genidm.errors import BadInput
+from genidm.paper.idm import Architecture
+from genidm.paper.pairs import Pairs, with_nearest_side
 from genidm.robots import Ant, State
 from genidm.robots.humanoid import Humanoid
 from genidm.robots.mujoco import REFLECTION, image_of
@@ -169,6 +172,32 @@ def test_a_policy_sees_the_nearest_side_as_front(ant: Ant) -> None:
             turned = ant.action.turn_body(turned)
         assert_close(turned, a, atol=1e-6)
     assert_close(view.seen_action(ant, robots, acted), np.broadcast_to(a, (4, 8)), atol=1e-6)
+
+
+def test_samples_face_their_direction_by_their_nearest_side(ant: Ant) -> None:
+    """A controller of such samples turns back what it answers, for any robot and goal."""
+    yaw = jnp.linspace(-3, 3, LANES)
+    s = np.asarray(ant.reset(keys(6), yaw).observation)
+    rng = np.random.default_rng(0)
+    d = np.float32(controller.direction(jnp.asarray(rng.normal(size=(2, LANES, 3)))))
+    samples = Pairs(np.stack([s, s]), np.stack([d[0], d[0]]), rng.uniform(-1, 1, (LANES, 8)))
+    turned = with_nearest_side(ant, samples)
+    off = controller.relative_bearing(ant, turned.s[0], turned.d[0])
+    assert np.abs(off).max() < np.pi / 4 + 1e-3
+    before = controller.relative_bearing(ant, s, d[0])
+    quarters = np.asarray(symmetry.quarters_to(before, jnp.zeros(LANES)))
+    assert len(set(quarters.tolist())) >= 4
+    assert_close(turned.a, ant.action.turn_body_by(samples.a, quarters), atol=1e-6)
+    assert_close(turned.s[1], ant.observation.turn_body_by(s, quarters), atol=1e-5)
+
+    architecture = Architecture(8, (16,), (16,), None)
+    params = architecture.init(jax.random.key(0), ant.observation.size)
+    size = ant.observation.size
+    plain = Controller(params, jnp.zeros(size), jnp.ones(size), architecture, "heading", ant)
+    sided = plain.replace(nearest_side=True)
+    answer = ant.action.turn_body_by(plain(turned.s[0], d[0]), -quarters)
+    assert_close(sided(s, d[0]), answer, atol=1e-4)
+    assert np.abs(sided(s, d[0]) - plain(s, d[0])).max() > 0.1
 
 
 def test_only_a_body_with_four_sides_has_a_nearest_one() -> None:

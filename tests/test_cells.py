@@ -10,17 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bits import truncate
+from bits import same, truncate
 from point import Point
-from small_cells import LR, VGCP, Finished, command, counted, files, options, stage_of
+from small_cells import LR, RS, VGCP, Finished, command, counted, files, options, stage_of
 from tiny import TEST
 
 from genidm import controller
 from genidm.agents.policy import Policy
+from genidm.errors import BadInput
 from genidm.evaluation import stats
 from genidm.evaluation.episodes import Episodes
 from genidm.evaluation.scenarios import scenarios
 from genidm.files import load_arrays
+from genidm.paper import methods
 from genidm.paper.generalize import Generalize
 from genidm.progress import METRICS, read_metrics
 from genidm.provenance import code_digest
@@ -122,6 +124,28 @@ def test_the_numbers_of_a_row_are_those_of_its_episodes(finished: Finished) -> N
     assert (episodes.path_length <= 2 + 1e-4).all() and (episodes.path_length > 0).all()
     gained = episodes.start - episodes.closest
     assert (gained >= 0).all() and (gained <= episodes.path_length + 1e-4).all()
+
+
+def test_the_agent_turned_is_the_policy_of_the_record_that_a_fit_learns_from(copy: Path) -> None:
+    agent = methods.AgentTurned("AGENT", LR.agent, LR.task)
+    run = make_run(Point(), agent, options(copy))
+    fitted = make_run(Point(), LR, options(copy))
+    with counted() as calls:
+        stage = run.run_test(scenarios(Point(), 10, 2))
+    assert calls == Counter(run=1)  # nothing is collected or fitted
+    assert run.policy_stage.directory == fitted.experience_stage.directory
+    policy = controller.load(run.policy_stage.path("policy"), Point())
+    assert run.controller().params.keys() == policy.params.keys() and run.controller().faces_goal
+    same(run.controller().params, policy.params)
+    summary = stage.summary()
+    assert (summary["method"], summary["interactions"], summary["replayed"]) == ("AGENT", 1024, 0)
+    assert [s.partition("-")[0] for s in summary["stages"]] == ["experience", "AGENT"]
+
+
+def test_an_agent_that_learns_nothing_cannot_be_turned(tmp_path: Path) -> None:
+    agent = methods.AgentTurned("AGENT", RS.agent, RS.task)
+    with pytest.raises(BadInput, match="RandomActions learns no policy"):
+        make_run(Point(), agent, options(tmp_path)).controller()
 
 
 def test_a_second_run_does_nothing_again_but_the_report(copy: Path, tmp_path: Path, capsys) -> None:

@@ -17,7 +17,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.sac import networks as sac_networks
 from point import Point
 
-from genidm import controller, devices, files
+from genidm import controller, devices, files, symmetry
 from genidm.agents.ddpg import DDPG
 from genidm.agents.policy import Policy
 from genidm.agents.ppo import PPO
@@ -133,6 +133,24 @@ def test_each_kind_of_controller_is_read_as_what_it_is(tmp_path: Path) -> None:
     policy("SAC", GoToGoal()).save(tmp_path / "policy")
     kinds = [type(controller.load(tmp_path / x, ROBOT)) for x in ("controller", "policy")]
     assert kinds == [Controller, Policy]
+
+
+def test_the_agent_turned_walks_to_the_goal_as_it_walks_to_x(tmp_path: Path) -> None:
+    """With the world turned so that the goal lies on +x, it acts as without a goal."""
+    plain = policy("PPO", TASKS["forward"])
+    turned = plain.replace(faces_goal=True)
+    s, goal = questions()
+    angle = jnp.arctan2(goal[..., 1], goal[..., 0])
+    expected = ask(plain, ROBOT.observation.rotate(s, -angle), goal)
+    np.testing.assert_allclose(ask(turned, s, goal), expected, atol=1e-5)
+    yaw = jnp.float32(0.7)
+    around = ask(turned, ROBOT.observation.rotate(s, yaw), symmetry.rotate_vector(goal, yaw))
+    np.testing.assert_allclose(around, expected, atol=1e-4)
+    assert np.abs(ask(turned, s, -goal) - expected).max() > 1e-2
+    turned.save(tmp_path / "turned")
+    read = controller.load(tmp_path / "turned", ROBOT)
+    assert isinstance(read, Policy) and read.faces_goal and not read.nearest_side
+    np.testing.assert_array_equal(ask(read, s, goal), ask(turned, s, goal))
 
 
 def test_nothing_is_written_over_unasked(tmp_path: Path) -> None:
