@@ -22,8 +22,8 @@ class AntV2(Ant):
     falls and costs are those of `Ant`: gym's clips wrenches along the world's axes, and its
     quaternions have either sign.
 
-    Pyramidal cones depend on the world's axes. So a replay from a rotated start (𝒢) deviates by
-    centimetres within 10 steps (docs/physics.md).
+    Where a foot slips, pyramidal cones depend on the world's axes. Under strong actions, a replay
+    from a rotated start (𝒢) deviates by centimetres within 10 steps (docs/physics.md).
 
     Args:
       solver: settings of the constraint solver; default: MuJoCo's own.
