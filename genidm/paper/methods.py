@@ -261,6 +261,7 @@ ANT = column(
         walk=WalkForward(start_yaw=0.5, turn_rate=0.01, turn_spread=math.pi, nearest_side=True),
         goal_horizon=25,
         nearest_side=True,
+        mirror=True,
     ),
 )
 HUMANOID = column(
