@@ -34,7 +34,7 @@ robots.minitaur_env
 robots
 rollout tasks
 experience
-agents.policy agents.buffer
+agents.policy agents.buffer agents.mirroring
 agents.base agents.her
 agents.rollout_then_learn agents.unroll agents.remembering
 agents.off_policy

@@ -302,6 +302,22 @@ def actions(agent: OffPolicy, count: int = 4000) -> tuple[np.ndarray, np.ndarray
     return np.asarray(a), raw
 
 
+@pytest.mark.parametrize("kind", [SAC, DDPG])
+def test_a_mirrored_policy_acts_as_its_own_mirror_image(kind: Any) -> None:
+    agent = kind(**SETTINGS, mirror=True)
+    made = agent.algorithm(ROBOT, INPUTS)
+    policy = jax.jit(made.start)(jax.random.key(0)).policy
+    x = minibatch().observation[:, : ROBOT.observation.size + 3]
+    numbers = jax.vmap(made.draw)(jax.random.split(jax.random.key(1), BATCH))
+    wide = no_statistics(x.shape[-1])
+    intended = [
+        np.asarray(made.act(wide, policy, y, numbers)[1])
+        for y in (x, tasks.mirror_inputs(ROBOT, x))
+    ]
+    np.testing.assert_allclose(intended[1], intended[0] * [1, -1, -1], atol=1e-5)
+    assert np.abs(intended[0]).min(axis=0).max() > 0
+
+
 def test_half_of_a_minibatch_is_reflected() -> None:
     rng = np.random.default_rng(2)
     s, goal = rng.normal(size=(2, BATCH, ROBOT.observation.size)), rng.normal(size=(2, BATCH, 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -15,6 +16,7 @@ from brax.training.networks import FeedForwardNetwork, make_policy_network, make
 from brax.training.types import Transition as BraxTransition
 
 from genidm.agents.base import Metrics
+from genidm.agents.mirroring import mirror_policy_output, mirrored
 from genidm.agents.off_policy import Algorithm, OffPolicy
 from genidm.agents.policy import normalize
 from genidm.checks import check, number
@@ -54,8 +56,11 @@ class DDPG(OffPolicy):
     def networks(self, robot: Robot, size: int) -> tuple[FeedForwardNetwork, FeedForwardNetwork]:
         """Brax's policy network (before tanh) and critic, with normalised inputs."""
         actions = robot.action.size
+        policy = make_policy_network(actions, size, normalize, self.policy_hidden_layer_sizes)
+        if self.mirror:
+            policy = mirrored(robot, policy, functools.partial(mirror_policy_output, robot))
         return (
-            make_policy_network(actions, size, normalize, self.policy_hidden_layer_sizes),
+            policy,
             make_q_network(size, actions, normalize, self.critic_hidden_layer_sizes, n_critics=1),
         )
 

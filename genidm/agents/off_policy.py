@@ -104,7 +104,8 @@ class OffPolicy(LearningAgent):
       policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
       critic_hidden_layer_sizes: widths of the critics' hidden layers.
       her: settings of relabelling; None keeps the original goals and rewards.
-      mirror: reflect half of the sampled steps, so that the gait becomes its own mirror image.
+      mirror: the policy is its own mirror image (`mirroring`), and the critics learn from steps of
+        which half are reflected.
     """
 
     activation: ClassVar[Activation] = "relu"

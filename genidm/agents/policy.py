@@ -20,7 +20,7 @@ from genidm import files
 from genidm.checks import check_value, layers, one_of
 from genidm.robots.base import Robot
 from genidm.symmetry import quarters_to
-from genidm.tasks import inputs
+from genidm.tasks import inputs, mirror_inputs
 
 Activation = Literal["tanh", "relu"]
 ACTIVATIONS: dict[Activation, Callable[[jax.Array], jax.Array]] = {
@@ -67,6 +67,7 @@ class Policy(flax.struct.PyTreeNode):
         towards +x walks to the goal, without any fit.
       nearest_side: whether the side of the body that is nearest to +x counts as its front
         (`genidm.tasks.WalkForward`).
+      mirror: whether the policy is its own mirror image (`mirroring`).
     """
 
     params: Any
@@ -78,6 +79,7 @@ class Policy(flax.struct.PyTreeNode):
     robot: Robot = flax.struct.field(pytree_node=False)
     faces_goal: bool = flax.struct.field(pytree_node=False, default=False)
     nearest_side: bool = flax.struct.field(pytree_node=False, default=False)
+    mirror: bool = flax.struct.field(pytree_node=False, default=False)
 
     def __call__(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """Actions `[..., A]` for states `[..., S]` and relative goals `[..., 3]`, metres.
@@ -98,9 +100,16 @@ class Policy(flax.struct.PyTreeNode):
     def _action(self, s: jax.Array, relative_goal: jax.Array) -> jax.Array:
         """The output `[..., A]` of the network, squashed."""
         x = inputs(s, relative_goal if self.goal_conditioned else None)
+        mean = self._mean(x)
+        if self.mirror:
+            image = self._mean(mirror_inputs(self.robot, x))
+            mean = 0.5 * (mean + self.robot.action.mirror(image))
+        return jnp.tanh(mean)
+
+    def _mean(self, x: jax.Array) -> jax.Array:
         x = normalize(x, running_statistics.NestedMeanStd(self.mean, self.std))
-        out = self._network().apply(self.params, x)
-        return jnp.tanh(out[..., : self.robot.action.size])
+        out: jax.Array = self._network().apply(self.params, x)
+        return out[..., : self.robot.action.size]
 
     def _network(self) -> MLP:
         """The policy network: it outputs the mean and, for PPO and SAC, the standard deviation."""
@@ -136,6 +145,7 @@ class Policy(flax.struct.PyTreeNode):
             "goal_conditioned": self.goal_conditioned,
             "faces_goal": self.faces_goal,
             "nearest_side": self.nearest_side,
+            "mirror": self.mirror,
         }
         files.save_arrays(path, leaves, meta, overwrite)
 
@@ -146,11 +156,13 @@ class Policy(flax.struct.PyTreeNode):
         Raises:
           BadInput: the metadata of the network is not valid.
         """
-        meta = {"faces_goal": False, "nearest_side": False} | meta  # not in older files
+        # Older files do not have these.
+        meta = dict.fromkeys(("faces_goal", "nearest_side", "mirror"), False) | meta
         either = one_of((False, True))
         for name, allowed in (
             ("policy_hidden_layer_sizes", layers), ("activation", one_of(ACTIVATIONS)),
             ("goal_conditioned", either), ("faces_goal", either), ("nearest_side", either),
+            ("mirror", either),
         ):  # fmt: skip
             check_value(name, meta[name], allowed)
         return cls(
@@ -161,4 +173,5 @@ class Policy(flax.struct.PyTreeNode):
             robot=robot,
             faces_goal=meta["faces_goal"],
             nearest_side=meta["nearest_side"],
+            mirror=meta["mirror"],
         )

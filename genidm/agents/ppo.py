@@ -27,6 +27,7 @@ from flax import linen
 from jax.sharding import Mesh
 
 from genidm.agents.base import Metrics
+from genidm.agents.mirroring import mirror_policy_output, mirrored
 from genidm.agents.policy import Activation, no_statistics, normalize
 from genidm.agents.rollout_then_learn import AgentState, LearningAgent, RolloutThenLearn
 from genidm.agents.unroll import generate_unroll
@@ -34,7 +35,7 @@ from genidm.checks import check, count, layers, number, positive
 from genidm.errors import BadInput
 from genidm.experience import Experience
 from genidm.robots.base import Robot
-from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size, mirror_inputs
+from genidm.tasks import EnvState, Task, Transition, bootstrapped_reward, input_size
 
 # The metrics of Brax's loss that are logged.
 LOSSES = ("policy_loss", "v_loss", "kl_mean", "policy_dist_mean_std")
@@ -73,8 +74,7 @@ class PPO(LearningAgent):
       policy_hidden_layer_sizes: widths of the policy's hidden layers (Table 2: 64×64).
       value_hidden_layer_sizes: widths of the value function's hidden layers.
       max_grad_norm: maximum norm of the gradients; larger ones are clipped.
-      mirror: also learn from the mirror image of every step, as rsl_rl does, so that the gait
-        becomes its own mirror image. The mirror image of a step has its old probability.
+      mirror: policy and value function are their own mirror images (`mirroring`).
     """
 
     activation: ClassVar[Activation] = "tanh"
@@ -119,7 +119,7 @@ class PPO(LearningAgent):
 
     def networks(self, robot: Robot, task: Task) -> ppo_networks.PPONetworks:
         """Brax's policy and value networks, with normalised inputs."""
-        return ppo_networks.make_ppo_networks(
+        made = ppo_networks.make_ppo_networks(
             input_size(robot, task),
             robot.action.size,
             preprocess_observations_fn=normalize,
@@ -127,6 +127,12 @@ class PPO(LearningAgent):
             value_hidden_layer_sizes=self.value_hidden_layer_sizes,
             activation=linen.tanh,
         )
+        if not self.mirror:
+            return made
+        mirror = functools.partial(mirror_policy_output, robot)
+        policy = mirrored(robot, made.policy_network, mirror)
+        value = mirrored(robot, made.value_network, lambda x: x)
+        return made.replace(policy_network=policy, value_network=value)
 
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
         """The rollout and learning programs of an iteration."""
@@ -137,7 +143,7 @@ class PPO(LearningAgent):
         rollout = functools.partial(
             _rollout, robot, task, networks, self.unroll_length, self.discounting
         )
-        learn = functools.partial(self._learn, robot, networks, optimizer)
+        learn = functools.partial(self._learn, networks, optimizer)
 
         def start(key: jax.Array) -> AgentState:
             lanes, policy, value, stream = jax.random.split(key, 4)
@@ -158,7 +164,6 @@ class PPO(LearningAgent):
 
     def _learn(
         self,
-        robot: Robot,
         networks: ppo_networks.PPONetworks,
         optimizer: optax.GradientTransformation,
         training: TrainingState,
@@ -166,9 +171,6 @@ class PPO(LearningAgent):
     ) -> tuple[TrainingState, Metrics]:
         """Learn from a batch `[unroll_length, num_envs, ...]`, in shuffled minibatches."""
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
-        if self.mirror:
-            batch = with_mirror_images(robot, batch)
-        lanes = batch.reward.shape[0]
         statistics = running_statistics.update(training.statistics, batch.observation)
         loss = functools.partial(
             compute_ppo_loss,
@@ -189,7 +191,9 @@ class PPO(LearningAgent):
 
         def epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
             order, noise = jax.random.split(key)
-            parts = _shuffled(batch, jax.random.permutation(order, lanes), self.num_minibatches)
+            parts = _shuffled(
+                batch, jax.random.permutation(order, self.num_envs), self.num_minibatches
+            )
             return jax.lax.scan(
                 minibatch, carry, (parts, jax.random.split(noise, self.num_minibatches))
             )
@@ -264,29 +268,6 @@ def brax_transition(a: jax.Array, kept: dict[str, Any], after: jax.Array) -> Bra
             "state_extras": {"truncation": kept["truncation"]},
         },
     )
-
-
-def with_mirror_images(robot: Robot, batch: BraxTransition) -> BraxTransition:
-    """A batch `[B, T, ...]` and its reflection y → −y: `[2 B, T, ...]`."""
-    extras = batch.extras["policy_extras"]
-    mean, scale = jnp.split(extras["distribution_params"], 2, axis=-1)
-    # A standard deviation moves to the mirrored joint, but keeps its sign.
-    signs = robot.action.mirror(jnp.ones(robot.action.size))
-    params = [robot.action.mirror(mean), robot.action.mirror(scale) * signs]
-    reflected = batch._replace(
-        observation=mirror_inputs(robot, batch.observation),
-        action=robot.action.mirror(batch.action),
-        next_observation=mirror_inputs(robot, batch.next_observation),
-        extras={
-            **batch.extras,
-            "policy_extras": {
-                **extras,
-                "distribution_params": jnp.concatenate(params, axis=-1),
-                "raw_action": robot.action.mirror(extras["raw_action"]),
-            },
-        },
-    )
-    return jax.tree.map(lambda *x: jnp.concatenate(x), batch, reflected)
 
 
 def _shuffled(batch: Any, order: jax.Array, parts: int) -> Any:

@@ -103,10 +103,12 @@ class LearningAgent(Agent):
     Attributes:
       activation: activation of the policy's hidden layers.
       policy_hidden_layer_sizes: widths of the policy's hidden layers.
+      mirror: whether the policy is its own mirror image (`mirroring`).
     """
 
     activation: ClassVar[Activation]
     policy_hidden_layer_sizes: tuple[int, ...]
+    mirror: bool
 
     @abc.abstractmethod
     def programs(self, robot: Robot, task: Task, mesh: Mesh) -> RolloutThenLearn:
@@ -128,4 +130,5 @@ class LearningAgent(Agent):
             goal_conditioned=task.goal_conditioned,
             robot=robot,
             nearest_side=task.nearest_side,
+            mirror=self.mirror,
         )

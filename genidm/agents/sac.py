@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -18,6 +19,7 @@ from brax.training.networks import make_policy_network, make_q_network
 from brax.training.types import Transition as BraxTransition
 
 from genidm.agents.base import Metrics
+from genidm.agents.mirroring import mirror_policy_output, mirrored
 from genidm.agents.off_policy import Algorithm, OffPolicy
 from genidm.agents.policy import normalize
 from genidm.robots.base import Robot
@@ -48,10 +50,13 @@ class SAC(OffPolicy):
     def networks(self, robot: Robot, size: int) -> SACNetworks:
         """Brax's policy network and two critics, with normalised inputs."""
         distribution = NormalTanhDistribution(event_size=robot.action.size)
+        policy = make_policy_network(
+            distribution.param_size, size, normalize, self.policy_hidden_layer_sizes
+        )
+        if self.mirror:
+            policy = mirrored(robot, policy, functools.partial(mirror_policy_output, robot))
         return SACNetworks(
-            make_policy_network(
-                distribution.param_size, size, normalize, self.policy_hidden_layer_sizes
-            ),
+            policy,
             make_q_network(
                 size,
                 robot.action.size,
