@@ -68,7 +68,7 @@ def test_whole_episodes_are_held_out_with_2_percent_of_the_samples() -> None:
         np.testing.assert_array_equal(joined, getattr(every, name))
 
 
-def test_a_record_has_one_held_out_part_for_all_its_fits() -> None:
+def test_fits_to_the_same_steps_have_the_same_held_out_part() -> None:
     made = record([[20] * 60, [30] * 40])
     one = split_pairs(ROBOT, made, goal_horizon=H)[1]
     turned = replay(ROBOT, made, jax.random.key(0), Generalize("rotate"))

@@ -94,9 +94,9 @@ def split_pairs(
 ) -> tuple[Pairs, Pairs]:
     """Make `pairs`, and keep those of a few episodes apart, to measure the error of the fit.
 
-    Whole episodes are drawn at random until they hold 2 % of the samples. An episode with more
-    than 2 % of the samples (a short log) counts as several, of consecutive samples. The draw
-    depends on the record alone, so that all fits to it have the same held-out episodes.
+    Whole episodes are drawn at random that hold up to 2 % of the samples together. An episode
+    with more than 2 % (a short log) counts as several, of consecutive samples. Records with the
+    same usable steps have the same held-out ones, so that their fits can be compared.
 
     Args:
       robot: robot of the record.
