@@ -16,7 +16,7 @@ from genidm.checks import check, count
 from genidm.errors import BadInput
 from genidm.evaluation.scenarios import Scenarios
 from genidm.offline.methods import AnyMethod, by_name
-from genidm.paper.methods import EXTRA, ORDER
+from genidm.paper.methods import EXTRA, ORDER, InverseDynamics
 from genidm.robots import Robot
 from genidm.robots import by_name as robot_by_name
 from genidm.runs.cell import announce, make_run, render_run, scenarios_of, write_report
@@ -101,7 +101,9 @@ def work(robot: Robot, methods: Methods, options: Table, make: MakeRun = make_ru
     """The runs of the table, seed by seed; later seeds use only the first scenarios."""
     numbers = range(options.seed, options.seed + options.seeds)
     seeds = [dataclasses.replace(options, seed=seed) for seed in numbers]
-    first, *later = ([make(robot, m, these) for m in grouped(methods)] for these in seeds)
+    first, *later = (
+        [make(robot, m, _options_of(m, these)) for m in grouped(methods)] for these in seeds
+    )
     scenarios = few = scenarios_of(first[0], options)
     if later and options.episodes_per_extra_seed < scenarios.shape[1]:
         few = scenarios_of(
@@ -112,6 +114,12 @@ def work(robot: Robot, methods: Methods, options: Table, make: MakeRun = make_ru
         *(Work(this, scenarios, scenarios) for this in first),
         *(Work(this, few, scenarios) for this in rest),
     ]
+
+
+def _options_of(method: AnyMethod, options: Table) -> Table:
+    """`options`; `paper_settings` is only for methods that fit, the others are the paper's."""
+    fits = isinstance(method, InverseDynamics)
+    return dataclasses.replace(options, paper_settings=options.paper_settings and fits)
 
 
 def run(

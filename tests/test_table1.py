@@ -129,6 +129,12 @@ def test_the_later_seeds_are_tested_on_the_beginning_of_the_bank(tmp_path: Path)
     assert {item.scenarios.shape for item in all_alike} == {(10, 2)}
 
 
+def test_papers_settings_are_for_the_methods_that_fit(tmp_path: Path) -> None:
+    todo = work(Point(), METHODS, options(tmp_path, seeds=1, paper_settings=True))
+    names = [item.run.method.name for item in todo]
+    assert sorted(names) == ["HF paper", "LR paper", "RS paper", "VGCP"]
+
+
 def test_every_method_with_every_seed_has_been_tested_once(finished: Path) -> None:
     tests = Counter(path.name.split("-")[1] for path in stages(finished, "test-*"))
     assert tests == dict.fromkeys(("RS", "VGCP", "LR", "HF"), 2)
