@@ -76,7 +76,8 @@ def test_scales_are_shares_of_the_paper() -> None:
     given = {
         name: make_run(Point(), methods.LR, Options(scale=name)) for name in ("quick", "paper")
     }
-    assert given["quick"].method.agent == quick.ppo != methods.LR.agent
+    assert given["quick"].method.agent == dataclasses.replace(quick.ppo, mirror=True)
+    assert given["quick"].method.agent != methods.LR.agent
     assert given["paper"].method.agent == methods.LR.agent
     assert this.method.agent == LR.agent  # what a user has set stands
     for wrong in ("huge", "0", "-1", "nan", "inf", ""):
@@ -141,7 +142,9 @@ def test_who_has_set_what_is_known(monkeypatch, tmp_path: Path) -> None:
     chosen, given, papers = ran[0].notes
     assert chosen.startswith("LR, chosen for this scale and machine: fit.updates 1000 (10000), ")
     assert given == "LR, set by you: fit.batch_size 64 (512)"
-    assert papers.startswith("LR, unlike the paper (see --paper-settings): fit.")
+    assert papers.startswith(
+        "LR, unlike the paper (see --paper-settings): agent.mirror True (False)"
+    )
     assert "fit.mean_latent False (True)" in papers
 
 

@@ -56,7 +56,7 @@ def test_it_acts_as_it_had_learned_to(agent: PPO | SAC) -> None:
 
 @pytest.fixture(scope="module")
 def rl() -> methods.InverseDynamics:
-    return tiny(methods.RL, agent=Frozen(LEARNER, fraction=0.5))
+    return tiny(methods.RL, agent=Frozen(LEARNER, fraction=0.5), fraction=1.0, skip=0.0)
 
 
 def options(out: Path, **changes) -> Options:

@@ -23,7 +23,7 @@ from genidm import robots
 from genidm.agents.random import RandomActions
 from genidm.paper import methods
 from genidm.runs import cell as cell_module
-from genidm.runs import run as stages
+from genidm.runs import fitting
 from genidm.runs.command import run_cli
 
 CALL = {"minutes": 1, "environment": {"versions": {}, "hardware": "a machine", "commit": None}}
@@ -208,7 +208,7 @@ def test_a_cell_that_fails_is_written_down_and_the_rest_goes_on(
 ) -> None:
     with monkeypatch.context() as m:
         m.setattr(cells, "run_method", lambda *args: 1 / 0)
-        m.setattr(stages, "replay", lambda *args: 1 / 0)
+        m.setattr(fitting, "replay", lambda *args: 1 / 0)
         assert run(m, tmp_path, "--methods", "LR", "HF") == 1
     found = section(tmp_path)
     assert [(x["part"], x["method"]) for x in found["failures"]] == [

@@ -297,7 +297,7 @@ def test_a_controller_with_other_bearings_than_two_is_refused(tmp_path: Path) ->
 
 def test_the_papers_settings_do_not_clip() -> None:
     assert not HF.clip_bearing
-    assert not paper_settings(dataclasses.replace(HF, clip_bearing=True)).clip_bearing
+    assert not paper_settings(dataclasses.replace(HF, clip_bearing=True), "ant").clip_bearing
 
 
 def test_a_fit_prints_what_it_has_seen(capsys) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from point import Point
+from small_cells import STAGES
 from tiny import AGENTS, TEST, tiny
 
 from experiments import latent_size
@@ -20,7 +21,6 @@ from genidm.agents.random import RandomActions
 from genidm.errors import BadInput
 from genidm.paper import methods
 from genidm.report.runs import find
-from genidm.runs import run as stages
 from genidm.runs.cell import make_run, scenarios_of
 from genidm.runs.command import run_cli
 
@@ -127,8 +127,8 @@ def test_a_second_run_only_draws_and_writes_where_it_is_told(finished: Path, mon
     def never(*args, **kwargs):
         raise AssertionError("there is nothing to make")
 
-    for name in ("collect", "replay", "fit", "run"):
-        monkeypatch.setattr(stages, name, never)
+    for name, module in STAGES.items():
+        monkeypatch.setattr(module, name, never)
     run(Point(), LR, options(finished, report_dir=finished / "results"))
     names = {path.name for path in (finished / "results").iterdir()}
     assert names == {"point_latent_size.json", "point_latent_size.png"}

@@ -65,10 +65,10 @@ def test_a_robot_without_a_file_of_its_own_is_run(
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
-        ([], "give --robot and --method; robots: ant, humanoid, humanoid_world, minitaur; me"),
+        ([], "give --robot and --method; robots: ant, ant_v2, humanoid, humanoid_world, "),
         (["--robot", "ant"], "give --robot and --method; robots: ant, "),
         (["--method", "LR"], "give --robot and --method; robots: ant, "),
-        (["--robot", "any", "--method", "LR"], "no robot is called 'any'; robots: ant, humanoid, "),
+        (["--robot", "any", "--method", "LR"], "no robot is called 'any'; robots: ant, ant_v2, "),
         (["--robot", "ant", "--method", "XX"], "no method is called 'XX'; there are: RS, RL, VGCP"),
         (["--robot", "ant", "--method", "lr"], "no method is called 'lr'; there are: RS, RL, VGCP"),
         (["--method", "LR", "--robot"], "argument --robot: expected one argument"),

@@ -21,7 +21,7 @@ from genidm.agents.frozen import Acting, Frozen
 from genidm.agents.off_policy import OffPolicy
 from genidm.agents.rollout_then_learn import AgentState, RolloutThenLearn
 from genidm.experience import Experience, concatenate
-from genidm.paper.methods import LR, RL, RS, Method
+from genidm.paper.methods import LR, RS, Method
 from genidm.tasks import Transition
 
 
@@ -54,14 +54,15 @@ def acting(bench: Bench, *, method: Method) -> Probe:
     return _iterating(frozen, learning.prepare(lanes), lanes, lambda part: concatenate([part]))
 
 
-def unrecorded(bench: Bench) -> Probe:
+def unrecorded(bench: Bench, *, method: Method) -> Probe:
     """`collecting` with PPO, recording only the fields that PPO learns from."""
-    agent = _agent(bench, RL)
-    learning, learner = _started(bench, RL, agent)
+    agent = _agent(bench, method)
+    learning, learner = _started(bench, method, agent)
     whole = steps.record
 
-    def least(step: Transition) -> Experience:
-        return whole(step).replace(o_next=None, first=None, last=None, valid=None, physics=None)
+    def least(step: Transition, intended: jax.Array) -> Experience:
+        unused = ("s", "o", "o_next", "first", "last", "valid", "physics", "intended", "forward")
+        return whole(step, intended).replace(**dict.fromkeys(unused))
 
     with mock.patch.object(steps, "record", least):
         iterate = learning.prepare(learner)

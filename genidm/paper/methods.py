@@ -347,7 +347,7 @@ def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
     return dataclasses.replace(
         method,
         name=f"{name} paper",
-        agent=_without_mirror(method.agent),
+        agent=without_mirror(method.agent),
         task=WALK,
         fraction=protocol.FRACTION.get(name, 1.0),
         skip=0.0,
@@ -361,8 +361,8 @@ def paper_settings(method: InverseDynamics, robot: str) -> InverseDynamics:
     )
 
 
-def _without_mirror(agent: Any) -> Any:
+def without_mirror(agent: Any) -> Any:
     """An agent that learns from what it does alone."""
     if isinstance(agent, Frozen):
-        return dataclasses.replace(agent, agent=_without_mirror(agent.agent))
+        return dataclasses.replace(agent, agent=without_mirror(agent.agent))
     return dataclasses.replace(agent, mirror=False) if hasattr(agent, "mirror") else agent
